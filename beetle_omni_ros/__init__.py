@@ -104,16 +104,18 @@ def read_run(path: str | Path) -> FlightLog:
 
 def find_gap(runs: Sequence[str | Path], holdout: Sequence[str | Path] = (), *,
              robot: str | Path | None = None, apply: str | Path | None = None,
-             report: str | Path | None = None, quiet: bool = False) -> dict:
+             report: str | Path | None = None, form: str | None = None,
+             quiet: bool = False) -> dict:
     """
     Identify effects that the robot model lacks, as `beetle_omni gap` does.
 
     Args:
-        runs: bags for the fit.
-        holdout: bags for validation; by default the last of three or more runs.
+        runs: bags for the fit, or tables with ``form``.
+        holdout: flights for validation; by default the last of three bags or more.
         robot: robot file with which the flights are compared.
         apply: robot file to write, with the named effects.
         report: HTML page to write.
+        form: name or file of the format of tables.
         quiet: print nothing.
 
     Returns:
@@ -124,7 +126,7 @@ def find_gap(runs: Sequence[str | Path], holdout: Sequence[str | Path] = (), *,
 
     from beetle_omni_ros.identify.gap.command import gap_results
     return gap_results(list(map(_path, runs)), list(map(_path, holdout)), _path(robot),
-                       _path(apply), None, _path(report), Console(quiet=quiet))
+                       _path(apply), None, _path(report), Console(quiet=quiet), form=form)
 
 
 def trajectory(times, positions, quaternions, name: str = 'own trajectory'):

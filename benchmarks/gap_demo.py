@@ -3,7 +3,7 @@ The complete gap workflow, also as `make gap`: `python benchmarks/gap_demo.py`.
 
 A plant has an effect that is not in the robot file. Three of its flights under the NMPC are
 recorded, and `beetle_omni gap` analyses the bags. The robot file that it writes is tested by
-held-out free runs, and by the lemniscate under the NMPC with the old and the corrected model. The
+a held-out flight, and by the lemniscate under the NMPC with the old and the corrected model. The
 first effect is flown in real time through the ROS graph and both buses. The others use
 `beetle_omni evaluate --bag`, which is the same loop and faster, on all cores.
 """

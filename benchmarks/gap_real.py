@@ -18,7 +18,7 @@ import tempfile
 from rich.console import Console
 import yaml
 
-from beetle_omni_ros.identify.flights.command import table_results
+from beetle_omni_ros.identify.gap.command import gap_results
 from beetle_omni_ros.robot.resources import share_path
 
 BUILD = 'NanoBench-state-A'
@@ -35,8 +35,8 @@ def halves(folder):
 
 def analysed(case, fitted, judging, robot, apply=None):
     """One row of the table."""
-    result = table_results(fitted, judging, 'nanobench', robot, apply=apply,
-                           console=Console(quiet=True))
+    result = gap_results(fitted, judging, robot, apply, form='nanobench',
+                         console=Console(quiet=True))
     effects = [f"{' or '.join(e['names'])} " + ', '.join(
         f"{p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}]"
         for p in e['parameters'].values() if not isinstance(p['value'], list))

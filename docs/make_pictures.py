@@ -1,5 +1,5 @@
 """
-Fly and draw the pictures of the tutorials: ``python docs/make_pictures.py [NAME...]``.
+Fly and draw the pictures of the tutorials and of gap: ``python docs/make_pictures.py [NAME...]``.
 
 Pictures are written to docs/tutorials/pictures/. Each takes up to a minute; ``hardware_flight``
 needs ROS.
@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 import numpy as np
 
 import beetle_omni_ros as bo
+from beetle_omni_ros.identify.flights.page import picture_of
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, STYLE
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs.log import motion
@@ -120,13 +121,13 @@ def own_robot():
 
 
 def own_gap():
-    """Error of the model that flies freely, before and after."""
+    """Error of the model, before and after, and the mass."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         plant = folder / 'secret.yaml'
         plant.write_text('extends: robot.yaml\neffects: {mass: {mass: 3.3}}\n')
         for seed in (1, 2):
-            bo.simulate('nmpc', TASK, plant=plant, seed=seed, bag=folder / f'flight{seed}')
+            bo.simulate('nmpc', 'random8', plant=plant, seed=seed, bag=folder / f'flight{seed}')
         found = bo.find_gap([folder / 'flight1'], holdout=[folder / 'flight2'])
     drawn, (left, right) = figure(2)
     bars = [found['gap_before'], found['gap_after'], found['noise_floor']]
@@ -142,6 +143,13 @@ def own_gap():
     right.legend(loc='upper center')
     named(right, f"named: {', '.join(found['effects'][0]['names'])}", 'mass [kg]', '')
     return drawn
+
+
+def real_gap():
+    """Disagreement and sizes of three real flights, as on the page of `gap`."""
+    return picture_of(bo.find_gap(
+        sorted((ROOT / 'test/data/nanobench').glob('*.csv.gz')), form='nanobench',
+        robot=ROOT / 'params' / 'crazyflie.yaml', quiet=True))
 
 
 def hardware_flight():
@@ -168,7 +176,7 @@ def hardware_flight():
 
 
 PICTURES = {made.__name__: made for made in (first_flight, own_trajectory, own_controller,
-                                             own_robot, own_gap, hardware_flight)}
+                                             own_robot, own_gap, real_gap, hardware_flight)}
 
 
 def main(names):

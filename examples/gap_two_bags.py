@@ -15,11 +15,12 @@ import numpy as np
 
 import beetle_omni_ros
 
-POSES = [[0.8, 0.4, 1.2, 40, 20, 90], [-0.6, 0.8, 0.9, -30, 35, -120]]
+POSES = [[0.8, 0.4, 1.2, 40, 20, 90], [-0.6, 0.8, 0.9, -30, 35, -120],
+         [-0.7, 0.5, 1.0, -90, 10, -60], [0.9, -0.6, 1.3, 60, 50, 100], [0, 0.4, 1.1, 170, 0, 20]]
 
 
 def record(folder):
-    """Record two short flights in a hidden wind [N]; return their bags."""
+    """Record two flights of 40 s in a hidden wind [N]; return their bags."""
     robot = beetle_omni_ros.robot()
     windy = replace(robot, effects={'wind': {'force': (1.2, -0.8, 0.0)}})
     bags = [Path(folder) / f'flight{seed}' for seed in (0, 1)]

@@ -262,10 +262,10 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
 
 @app.command()
 def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
-            'Recorded flights (bags), or logs of the joints (CSV, or bags with only joint_states '
-            'and command).'))],
+            'Recorded flights: bags, or with --format tables; or logs of the joints (CSV, or bags '
+            'with only joint_states and command).'))],
         holdout: Annotated[list[Path], Option(metavar='RUN...', help=(
-            'Flights for validation only. Default: the last run of three or more.'))] = (),
+            'Flights for validation only. Default: the last of three bags or more.'))] = (),
         robot: TheRobotOption = None,
         apply: Annotated[Path | None, Option(callback=writable, metavar='FILE', help=(
             'Write a robot file with the named effects.'))] = None,
@@ -282,25 +282,16 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
             'Flights are tables (CSV, .gz) with the columns of this format: nanobench, '
             'crazypad_motor, or a YAML file.'))] = None,
         alpha: Annotated[float, Option(metavar='P', help=(
-            'With --format: accepted probability of a false alarm.'))] = 0.05,
+            'Accepted probability of a false alarm.'))] = 0.05,
         json_path: JsonOption = None):
     """
     Identify and add effects that the model lacks from flights.
 
     Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
     """
-    if form is not None:
-        for name, value in (('page', page), ('gap', parameters), ('fix', fix),
-                            ('tolerances', tolerances)):
-            if value:
-                raise ParameterError(f'--{name}: expected without --format, which does not '
-                                     'support it')
-        from beetle_omni_ros.identify.flights.command import table_results
-        result = table_results(runs, holdout, form, robot, apply, json_path, alpha)
-        return 3 if result['verdict'] == 'bad_data' else 0
     from beetle_omni_ros.identify.gap.command import run_gap
     return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
-                   tolerances=tolerances)
+                   tolerances=tolerances, form=form, alpha=alpha)
 
 
 @app.command()

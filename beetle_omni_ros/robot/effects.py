@@ -173,12 +173,11 @@ def joint_friction(servo, joint, coulomb, stiction):
 
 
 def _delay(typical, smallest=0.003, **more):
-    return {'delay': EffectParameter('s', 0.0, -0.05, 0.2, typical, smallest, curved=True, **more)}
+    return {'delay': EffectParameter('s', 0.0, -0.05, 0.2, typical, smallest, **more)}
 
 
 def _number(key, unit, low, high, typical, smallest, step=0.01, **more):
-    return EffectParameter(unit, NAN, low, high, typical, smallest, number=key, step=step,
-                           curved=True, **more)
+    return EffectParameter(unit, NAN, low, high, typical, smallest, number=key, step=step, **more)
 
 
 # In order of application: the true tilt first, because it changes the thrust directions.
@@ -245,8 +244,7 @@ CATALOGUE: dict[str, Effect] = {
         'exp((0.25 m - h) / 0.25 m); h: rotor above the floor', 'hover below 0.6 m',
         ('thrust_coefficient', 'mass', 'tilt_thrust_loss'),
         'hover ladder at 0.2, 0.3, 0.5, 1.0 and 1.5 m at one state of charge',
-        ground_effect, forms=({'exponential_share': 0.0}, {'exponential_share': 1.0}),
-        one_regime=True),
+        ground_effect),
     'rotor_drag': Effect(
         'body', {'coefficient': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.06)},
         'H-force of Faessler et al. 2018, in the rotor plane, grows with rotor speed '
@@ -277,8 +275,7 @@ CATALOGUE: dict[str, Effect] = {
                  'cosine_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
         'f_i (1 - L s(q)), s = sin^2 q / 0.75 or 2 (1 - cos q): arm and body in the wake',
         'large tilts', ('thrust_coefficient', 'mass', 'ground_effect'),
-        'one attitude with tilts changed by internal force', tilt_thrust_loss,
-        forms=({'cosine_share': 0.0}, {'cosine_share': 1.0}), one_regime=True),
+        'one attitude with tilts changed by internal force', tilt_thrust_loss),
     'wind': Effect(
         'body', {'force': EffectParameter('N', (0.0,) * 3, -100, 100, 1.0, 0.1)},
         'constant force in world', 'any flight; yaw turns', ('mass', 'imu_misalignment',
@@ -293,9 +290,7 @@ CATALOGUE: dict[str, Effect] = {
         'part about the tilt axis loads the servo where joint_share is 1',
         'fast turns and fast tilting', ('inertia', 'rotor_acceleration_torque', 'rotor_lag'),
         'fast tilting by internal force at rest', propeller_gyroscopic_torque,
-        gyroscopic_load, channels='BJ',
-        forms=({'spin_up_share': 0.0}, {'spin_up_share': -1.0}, {'joint_share': 1.0}),
-        one_regime=True),
+        gyroscopic_load, channels='BJ'),
     'rotor_acceleration_torque': Effect(
         'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0, 0.066,
                                                               0.008)},
@@ -312,12 +307,10 @@ CATALOGUE: dict[str, Effect] = {
         'rotor', {'time_constant': _number('rotors.time_constant', 's', 0.001, 2.0, 0.4, 0.12,
                                            step=0.02, tolerance='lag')},
         "T f' + f = f*", 'thrust steps', ('rotor_dead_time', 'axial_inflow', 'command_latency'),
-        'thrust chirp 0.5 to 8 Hz: a lag reduces the amplitude, a delay shifts the phase only',
-        same_response='rotor_dead_time'),
+        'thrust chirp 0.5 to 8 Hz: a lag reduces the amplitude, a delay shifts the phase only'),
     'rotor_dead_time': Effect(
         'rotor', _delay(0.015), 'f*(t - d): delay of speed controllers and PWM', 'thrust steps',
-        ('rotor_lag', 'command_latency'), 'thrust chirp 0.5 to 8 Hz', delays=('thrust',),
-        same_response='rotor_lag'),
+        ('rotor_lag', 'command_latency'), 'thrust chirp 0.5 to 8 Hz', delays=('thrust',)),
     'thrust_saturation': Effect(
         'rotor', {'thrust_max': _number('rotors.thrust_max', 'N', 0.01, 200, 0.3, 0.02)},
         'f = min(f*, f_max): voltage or speed controller limit', 'commands at the limit',
@@ -358,14 +351,13 @@ CATALOGUE: dict[str, Effect] = {
         channels='J', starts=((1.1,), (0.8,), (0.5,)), limit=('torque', 0.98)),
     'joint_friction': Effect(
         'joint', dict.fromkeys(('coulomb', 'stiction'), EffectParameter(
-            'N m', 0.0, 0.0, 1.0, 0.01, 0.002, of_each=True, step=5e-4, curved=True)),
+            'N m', 0.0, 0.0, 1.0, 0.01, 0.002, of_each=True, step=5e-4)),
         "-coulomb sgn(q') while sliding, up to stiction at rest (Armstrong-Helouvry 1994); "
         'smooth over 0.05 rad/s in the model', 'slow reversals of the tilts',
         ('joint_backlash', 'joint_bandwidth'), 'triangle of 2 deg at 0.1 Hz',
         servo=joint_friction, channels='J', starts=((0.004, 0.004), (0.012, 0.015))),
     'joint_backlash': Effect(
-        'joint', {'gap': EffectParameter('rad', 0.0, 0.0, 0.3, 0.01, 0.003, of_each=True,
-                                         curved=True),
+        'joint', {'gap': EffectParameter('rad', 0.0, 0.0, 0.3, 0.01, 0.003, of_each=True),
                   'at_encoder': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
         'play of width gap between motor and rotor; the encoder is on the side of the motor, with '
         'at_encoder 1 on that of the rotor', 'reversals of the tilts',
@@ -373,7 +365,7 @@ CATALOGUE: dict[str, Effect] = {
         starts=((0.005,), (0.02,))),
     'joint_deflection': Effect(
         'joint', {'deflection_per_newton': EffectParameter('rad/N', 0.0, -0.05, 0.05, 0.002,
-                                                           0.0004, step=1e-4, curved=True)},
+                                                           0.0004, step=1e-4)},
         'thrust off the axis deflects the servo from its target: q* + c f', 'thrust steps',
         ('joint_friction', 'joint_offset'), 'internal force at rest, two levels',
         servo=joint_deflection, channels='J'),
@@ -396,7 +388,7 @@ CATALOGUE: dict[str, Effect] = {
     'mocap_time_offset': Effect(
         'timing', _delay(0.01, 0.002, sensor='mocap_delay', tolerance='delay'),
         'the pose is older than its stamp by d', 'fast turns', ('imu_filter_lag',),
-        'any turn above 1 rad/s', delays=('mocap',), own_clock=True, channels='AW'),
+        'any turn above 1 rad/s', delays=('mocap',), channels='AW'),
     'imu_filter_lag': Effect(
         'timing', _delay(0.01, 0.002, sensor='imu_delay', tolerance='delay'),
         'specific force and rates are older than their stamp by d: '
@@ -415,8 +407,7 @@ CATALOGUE: dict[str, Effect] = {
         'w_measured = w + b', 'any flight', (), 'at rest before take-off', channels='BW'),
     'imu_misalignment': Effect(
         'sensor', {'rotation': EffectParameter('rad', (0.0,) * 3, -0.5, 0.5, 0.02, 0.004,
-                                               sensor='imu_rotation', tolerance='angle',
-                                               curved=True)},
+                                               sensor='imu_rotation', tolerance='angle')},
         'IMU axes rotated by exp(rotation) against base_link',
         'several attitudes', ('mocap_misalignment', 'wind', 'joint_offset'),
         'hover in three attitudes', channels='BAW'),
@@ -427,8 +418,7 @@ CATALOGUE: dict[str, Effect] = {
         'flips by 180 deg', channels='BA'),
     'mocap_misalignment': Effect(
         'sensor', {'rotation': EffectParameter('rad', (0.0,) * 3, -0.5, 0.5, 0.02, 0.004,
-                                               sensor='mocap_rotation', tolerance='angle',
-                                               curved=True)},
+                                               sensor='mocap_rotation', tolerance='angle')},
         'marker axes rotated by exp(rotation) against base_link', 'several attitudes',
         ('imu_misalignment', 'wind'), 'hover at yaw 0, 90, 180 and 270 deg', channels='AW'),
 }

@@ -84,7 +84,6 @@ class EffectParameter:
     tolerance: str = ''     # between robots of one type: tolerance_... of params/gap.yaml
     least: float = 0.02     # smallest ratio to the robot file's own number in a fit
     step: float = 1e-3      # of a fit's derivatives; of the logarithm for the file's own numbers
-    curved: bool = False    # these derivatives change during a fit
     form: bool = False      # it only chooses a form of the effect and is not fitted
 
 
@@ -139,7 +138,6 @@ class Effect:
     each: str = ''      # 'rotor' or 'joint' if the parameters are (4,), one for each
     # Delayed quantities: 'tilt' and 'thrust' commands, readings of 'imu', 'mocap', 'encoders'.
     delays: tuple[str, ...] = ()
-    own_clock: bool = False     # these readings are stamped by another clock and may appear early
     # Affected measurements. B: forces and torques, J: joints, A: MoCap's acceleration, W: MoCap's
     # angular velocity; A and W against the IMU.
     channels: str = 'B'
@@ -148,9 +146,6 @@ class Effect:
     # fraction of the robot file's limit.
     starts: tuple[tuple[float, ...], ...] = ()
     limit: tuple[str, float] | None = None
-    forms: tuple[dict[str, float], ...] = ({},)     # the parameters that choose each form
-    one_regime: bool = False    # it acts in one regime only, such as near the ground
-    same_response: str = ''     # entry that is another form of the same response
     allocated: bool = False     # the allocation includes it
     measured: tuple[str, ...] = ()  # terms of MEASURED; where one is None, it is left out
     # How the simulated plant includes a body effect. 'model': numbers of its bodies and rotors,

@@ -1,12 +1,17 @@
-"""Makes flights, lets workflows answer, keeps both, judges at the end."""
+"""Makes flights, lets `beetle_omni gap` answer blind, keeps both, judges at the end."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import hashlib
 import json
 import os
 from pathlib import Path
+import resource
+import shlex
+import subprocess
+import tempfile
+import time
 
 import joblib
 
@@ -14,49 +19,45 @@ from gap_data.cases import Case, load_settings
 from gap_data.flight import LostFlight
 from gap_data.judge import judge
 from gap_data.make import make_case, ROBOT_FILE
-from gap_data.score import score
-from gap_data.workflow import run_workflow, Workflow
 
-# (case, workflow's name or 'flights', judged or None, kept)
-Report = Callable[[Case, str, dict | None, bool], None]
+KEYS = ('verdict', 'effects', 'where', 'gap_before', 'gap_after', 'noise_floor', 'closure',
+        'candidates', 'next_experiment')
 
 
-def run_campaign(cases: list[Case], workflows: list[Workflow], folder: Path, *,
+def run_campaign(cases: list[Case], tool: str, folder: Path, *, version: str = '',
                  sealed: Path | None = None, robot_file: Path = ROBOT_FILE, fresh: bool = False,
-                 done: Report = lambda *_: None) -> dict[str, list[dict]]:
+                 timeout: float = 300.0,
+                 done: Callable[[Case, dict | None], None] = lambda *_: None) -> list[dict]:
     """
-    Run every workflow on every case, in joblib's configuration of the moment.
+    Ask the tool about every case, in joblib's configuration of the moment.
 
     Args:
         cases: which.
-        workflows: which; none makes the flights only.
+        tool: command that takes `gap` and its arguments; '' makes the flights only.
         folder: of flights and answers.
+        version: of the tool's code; answers of another one are not kept for this.
         sealed: of the labels; None is 'sealed' in ``folder``.
-        robot_file: what the workflows are told.
+        robot_file: what the tool is told.
         fresh: ask again where an answer is kept.
-        done: called as results come in.
+        timeout: [s] for a case.
+        done: called with what was judged, as results come in.
 
     Returns:
-        Workflow's name -> judged cases in the order given; lost flights are left out.
+        Judged cases in the order given; lost flights are left out.
 
     """
     sealed = sealed or folder / 'sealed'
-    order = {case.key(): k for k, case in enumerate(cases)}
-    judged: dict[str, dict[int, dict]] = {w.name: {} for w in workflows}
-    calls = (joblib.delayed(_one)(case, workflows, folder, sealed, robot_file, fresh)
+    place = hashlib.sha256((tool + version).encode()).hexdigest()[:8]
+    calls = (joblib.delayed(_one)(case, tool, folder, sealed, robot_file, timeout,
+                                  folder / 'answers' / place / f'{case.key()}.json', fresh)
              for case in cases)
-    for case, results in _unordered(calls):
-        if results is None:
-            done(case, 'flights', None, False)
-            continue
-        label = open_label(case, sealed)
-        for workflow in workflows:
-            run, kept = results[workflow.name]
-            result = judged[workflow.name][order[case.key()]] = judge(label, run)
-            done(case, workflow.name, result, kept)
-        if not workflows:
-            done(case, 'flights', None, False)
-    return {name: [found[k] for k in sorted(found)] for name, found in judged.items()}
+    judged = {}
+    for case, run in joblib.Parallel(return_as='generator_unordered', batch_size=1,
+                                     pre_dispatch='all')(calls):
+        if run:
+            judged[case.key()] = judge(open_label(case, sealed), run)
+        done(case, judged.get(case.key()))
+    return [judged[case.key()] for case in cases if case.key() in judged]
 
 
 def open_label(case: Case, sealed: Path) -> dict:
@@ -69,37 +70,66 @@ def open_label(case: Case, sealed: Path) -> dict:
             'name_is_right': bool(hover and hover['name_is_right'])}
 
 
-def _unordered(calls) -> Iterator:
-    parallel = joblib.Parallel(return_as='generator_unordered', batch_size=1, pre_dispatch='all')
-    yield from parallel(calls)
-
-
-def _one(case, workflows, folder, sealed, robot_file, fresh):
+def _one(case, tool, folder, sealed, robot_file, timeout, kept, fresh):
     """Runs in a worker."""
     try:
         flights = make_case(case, folder / 'flights', sealed, robot_file)
     except LostFlight:
         return case, None
-    results = {}
-    for workflow in workflows:
-        path = folder / 'answers' / f'{workflow.key()}' / f'{case.key()}.json'
-        if path.is_file() and not fresh:
-            results[workflow.name] = json.loads(path.read_text()), True
-            continue
-        run = run_workflow(workflow, flights)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f'{path.name}.{os.getpid()}')
-        partial.write_text(json.dumps(run))
-        os.replace(partial, path)
-        results[workflow.name] = run, False
-    return case, results
+    if not tool:
+        return case, None
+    if kept.is_file() and not fresh:
+        return case, json.loads(kept.read_text())
+    run = ask(tool, flights, timeout)
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    partial = kept.with_name(f'{kept.name}.{os.getpid()}')
+    partial.write_text(json.dumps(run))
+    os.replace(partial, kept)
+    return case, run
 
 
-def make_report(judged: dict[str, list[dict]], meta: dict) -> dict:
-    """Everything in one JSON: scores and, for each case, what was judged."""
-    return {'meta': meta,
-            'workflows': {name: score(rows) for name, rows in judged.items()},
-            'cases': judged}
+def ask(tool: str, case: Path, timeout: float) -> dict:
+    """
+    Run the tool on one case, in a process of its own that is told paths and nothing else.
+
+    Returns:
+        ``answer`` (the JSON, or None), ``problems`` of the JSON, ``status``, ``wall_s``,
+        ``cpu_s``, ``traceback`` (bool), ``message`` (end of standard error).
+
+    """
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    # beside the case, not in the temporary folder: a worker may be killed
+    with tempfile.TemporaryDirectory(prefix='.gap_', dir=case.parent) as folder:
+        words = [*shlex.split(tool), 'gap', *map(str, sorted(case.glob('fit_*'))), '--holdout',
+                 *map(str, sorted(case.glob('holdout_*'))), '--robot', str(case / 'robot.yaml'),
+                 '--apply', 'robot_new.yaml', '--json', 'gap.json', '--report', 'gap.html']
+        try:
+            done = subprocess.run(words, cwd=folder, capture_output=True, text=True,
+                                  errors='replace', check=False, timeout=timeout,
+                                  env={**os.environ, 'NO_COLOR': '1'})
+            status, text, printed = done.returncode, done.stderr, done.stdout + done.stderr
+        except subprocess.TimeoutExpired:
+            status, text, printed = 124, f'not finished after {timeout:g} s', ''
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        answer, problems = read_answer(Path(folder, 'gap.json'))
+    return {'answer': answer, 'problems': problems, 'status': status,
+            'wall_s': time.monotonic() - began,
+            'cpu_s': after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+            'traceback': 'Traceback (most recent call last)' in printed,
+            'message': text.strip()[-600:]}
+
+
+def read_answer(path: Path) -> tuple[dict | None, list[str]]:
+    """The JSON, and what is wrong with it after the interface."""
+    try:
+        answer = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        return None, [f'no JSON: {error}']
+    problems = [f'no key {key}' for key in KEYS if key not in answer]
+    problems += [f'{name} without {key}' for effect in answer['effects']
+                 for name, entry in effect['parameters'].items()
+                 for key in ('value', 'unit', 'interval') if key not in entry]
+    return answer, problems
 
 
 def code_key(paths: list[Path]) -> str:

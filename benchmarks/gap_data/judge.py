@@ -41,7 +41,7 @@ def judge(label: dict, run: dict) -> dict:
 
     Args:
         label: of :func:`gap_data.campaign.open_label`.
-        run: of :func:`gap_data.workflow.run_workflow`.
+        run: of :func:`gap_data.campaign.ask`.
 
     """
     case, truths = label['case'], label['effects']

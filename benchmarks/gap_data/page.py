@@ -23,49 +23,21 @@ def target(row: dict) -> str:
 
 
 def markdown(report: dict) -> str:
-    """The criteria and power of every workflow side by side, and the first one's confusions."""
-    names = list(report['workflows'])
-    lines = ['# Blind campaign', '', _describe(report), '']
-    for difficulty in ('clean', 'hard'):
-        tables = [report['workflows'][n]['criteria'][difficulty] for n in names]
-        if not any(row['count'] for row in tables[0]):
-            continue
-        lines += [f'## {difficulty.capitalize()} flights', '',
-                  '| | target | ' + ' | '.join(names) + ' |',
-                  '|---|---|' + '---|' * len(names)]
-        for rows in zip(*tables):
-            cells = [number(row) + (' **' if row['reached'] is False else '') for row in rows]
-            lines.append(f'| {rows[0]["name"]} | {target(rows[0])} | ' + ' | '.join(cells) + ' |')
-        lines.append('')
-    lines += ['`**` misses its target; in brackets the 95 % interval, in parentheses the number '
-              'of cases or values.', '', *_power_table(report, names)]
-    for difficulty, table in report['workflows'][names[0]]['confusion'].items():
-        if table:
-            lines += [f'## What {names[0]} answered, {difficulty}', '', '| truth | answers |',
-                      '|---|---|']
-            lines += [f'| {truth} | ' + ', '.join(
-                f'{answer} {count}' for answer, count in sorted(
-                    counts.items(), key=lambda item: -item[1])) + ' |'
-                for truth, counts in table.items()]
+    """The criteria, and the power."""
+    lines = ['# Blind campaign', '', f'{report["meta"]["cases"]} cases: '
+             f'`{report["meta"]["command"]}`', '']
+    for difficulty, rows in report['criteria'].items():
+        if any(row['count'] for row in rows):
+            lines += [f'## {difficulty.capitalize()} flights', '', '| | target | |',
+                      '|---|---|---|']
+            lines += [f'| {row["name"]} | {target(row)} | {number(row)}'
+                      f'{" **" if row["reached"] is False else ""} |' for row in rows]
             lines.append('')
-    return '\n'.join(lines)
-
-
-def _power_table(report, names):
-    rows = list(zip(*(report['workflows'][n]['power'] for n in names)))
-    if not rows:
-        return []
-    return ['## Power: share named, by multiples of the detection limit, hard flights', '',
-            '| times the limit | ' + ' | '.join(f'{n} | {n}, wrong name' for n in names) + ' |',
-            '|---|' + '---|---|' * len(names),
-            *(f'| {same[0]["multiple"]:g} | ' + ' | '.join(
-                f'{number(row["named"])} | {number(row["wrong"])}' for row in same) + ' |'
-              for same in rows), '']
-
-
-def _describe(report):
-    meta = report['meta']
-    return (f'Set {meta["set"]}, seed {meta["seed"]}, {meta["cases"]} cases, '
-            f'commands executed {1000 * meta["command_age"]:g} ms after their stamps; flights of '
-            'a generator that shares no equation with the package. The command that makes it '
-            f'again: `{meta["command"]}`.')
+    lines += ['`**` misses its target; in brackets the 95 % interval, in parentheses the number '
+              'of cases or values.', '']
+    if report['power']:
+        lines += ['## Power: hard flights, by multiples of the detection limit', '',
+                  '| times the limit | named | wrong name |', '|---|---|---|']
+        lines += [f'| {row["multiple"]:g} | {number(row["named"])} | {number(row["wrong"])} |'
+                  for row in report['power']]
+    return '\n'.join(lines) + '\n'

@@ -1,8 +1,6 @@
-"""All answers of one workflow as numbers: the issue's criteria, with their intervals."""
+"""All answers as numbers: the issue's criteria, with their intervals."""
 
 from __future__ import annotations
-
-from collections import Counter
 
 from gap_data.cases import DIFFICULTIES
 from gap_data.intervals import median, share
@@ -12,7 +10,7 @@ DELAY_LIMIT = 0.003  # [s]
 
 def score(judged: list[dict]) -> dict:
     """
-    Criteria by difficulty, confusion and power.
+    Criteria by difficulty, and power.
 
     Args:
         judged: of :func:`gap_data.judge.judge`, one for each case.
@@ -20,8 +18,6 @@ def score(judged: list[dict]) -> dict:
     """
     return {'criteria': {d: criteria([j for j in judged if j['difficulty'] == d], d)
                          for d in DIFFICULTIES},
-            'confusion': {d: confusion([j for j in judged if j['difficulty'] == d])
-                          for d in DIFFICULTIES},
             'power': power(judged)}
 
 
@@ -98,25 +94,6 @@ def _reached(value, relation, target):
     if relation == 'in':
         return target[0] <= value <= target[1]
     return value >= target if relation == '>=' else value <= target
-
-
-def answer_label(j: dict) -> str:
-    """One word for what was answered: the true name, 'set', a wrong name, or the verdict."""
-    if j['wrong'] and not any(j['named']):
-        return j['wrong'][0][0]
-    if any(j['named']):
-        return j['truth'][0] if j['exact'][0] else 'set with it'
-    return j['verdict'] if j['verdict'] not in ('named', 'named_set') else 'no_gap'
-
-
-def confusion(judged: list[dict]) -> dict[str, dict[str, int]]:
-    """True effect (single cases, none, outside) -> answer -> number of cases."""
-    table: dict[str, Counter] = {}
-    for j in judged:
-        if j['kind'] in ('singles', 'none', 'outside'):
-            table.setdefault(j['truth'][0] if j['truth'] else '(none)', Counter())[
-                answer_label(j)] += 1
-    return {truth: dict(counts) for truth, counts in sorted(table.items())}
 
 
 def power(judged: list[dict]) -> list[dict]:

@@ -4,18 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
-from beetle_omni_ros.identify.flights.command import body_keys, table_results
 from beetle_omni_ros.identify.flights.evidence import Judge, normal
 from beetle_omni_ros.identify.flights.motion import turning, wander
-from beetle_omni_ros.identify.flights.residual import TableFlight
+from beetle_omni_ros.identify.flights.results import expected
 from beetle_omni_ros.identify.flights.spectrum import EDGES, spectrum
 from beetle_omni_ros.identify.flights.table import Format, read_flight
-from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
+from beetle_omni_ros.identify.flights.table_verdict import load_tables
+from beetle_omni_ros.identify.gap.command import gap_results
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -80,6 +80,19 @@ def test_evidence_of_one_key_agrees_with_quadrature(positive):
                     0.5, points=[0, estimate], limit=200)[0]
     assert posterior.gain == pytest.approx(
         np.log(integral(slab)) - np.log(integral(narrow[0])), abs=1e-3)
+
+
+def test_evidence_of_a_typical_size_is_the_mean_over_its_estimates():
+    rng = np.random.default_rng(4)
+    found = normal([linear_flight(rng, np.zeros(1), keys=1)], ['a'], np.zeros(1))
+    judge = Judge(found, np.array([0.001]), np.array([0.003]), np.array([False]),
+                  np.zeros(1, dtype=int), 0.05, np.array([False]))
+    slab = np.hypot(0.001, 0.003)
+    sigma = (judge.posterior((0,)).deviation[0]**-2 - slab**-2)**-0.5
+    wide, null = np.hypot(sigma, slab), np.hypot(sigma, 0.001)
+    mean = quad(lambda x: norm.pdf(x, 0, wide) * (norm.logpdf(x, 0, wide)
+                                                  - norm.logpdf(x, 0, null)), -0.05, 0.05)[0]
+    assert expected(judge, [0]) == pytest.approx(mean, rel=1e-4) and mean > 0.1
 
 
 def test_noise_of_a_flexible_fit_is_not_too_small():
@@ -152,13 +165,17 @@ def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0, late=0
     return path
 
 
+def gap_of(flights, form, robot, **more):
+    return gap_results(flights, robot=robot, form=form, console=Console(quiet=True), **more)
+
+
 def named(result):
     return {name for effect in result['effects'] for name in effect['names']}
 
 
 def test_a_hidden_thrust_and_drag_are_named_with_their_sizes(tmp_path):
     flights = [write_flight(tmp_path / f'{k}.csv', k, scale=0.8, drag=0.012) for k in range(3)]
-    result = table_results(flights, [], 'nanobench', ROBOT)
+    result = gap_of(flights, 'nanobench', ROBOT)
     found = {effect['names'][0]: effect['parameters'] for effect in result['effects']}
     assert {'thrust_coefficient', 'rotor_drag'} == set(found)
     for name, key, true in (('thrust_coefficient', 'scale', 0.8),
@@ -171,7 +188,7 @@ def test_a_hidden_thrust_and_drag_are_named_with_their_sizes(tmp_path):
 
 def test_flights_of_the_robot_of_the_file_have_no_named_effect(tmp_path):
     flights = [write_flight(tmp_path / f'{k}.csv', 10 + k) for k in range(3)]
-    result = table_results(flights, [], 'nanobench', ROBOT)
+    result = gap_of(flights, 'nanobench', ROBOT)
     assert not result['effects']
     assert result['false_alarm_probability'] > 0.05
 
@@ -180,7 +197,7 @@ def test_a_file_that_ignores_the_voltage_is_told_so(tmp_path):
     robot = tmp_path / 'robot.yaml'
     robot.write_text('extends: crazyflie.yaml\neffects: {}\n')
     flights = [write_flight(tmp_path / f'{k}.csv', 20 + k) for k in range(3)]
-    result = table_results(flights, [], 'nanobench', robot, apply=tmp_path / 'corrected.yaml')
+    result = gap_of(flights, 'nanobench', robot, apply=tmp_path / 'corrected.yaml')
     assert 'voltage_sag' in named(result)
     assert 'voltage_sag' in (tmp_path / 'corrected.yaml').read_text()
 
@@ -188,8 +205,7 @@ def test_a_file_that_ignores_the_voltage_is_told_so(tmp_path):
 def test_mocap_shows_a_bias_of_the_accelerometer_whatever_the_thrust_is(tmp_path):
     path = write_flight(tmp_path / 'a.csv', 40, scale=0.8, bias=0.3, wander=3e-4, late=0.03)
     model, form = RobotParameters.load(ROBOT), Format.load('nanobench')
-    body = BodyModel(model, {**all_keys(model), **extra_keys()}, (0.0, 0.0))
-    flight = TableFlight(read_flight(path, form), model, body, body_keys(model))
+    flight, = load_tables([path], model, form)
     key = 'imu_accelerometer_bias.bias[2]'
     at = flight.channels.index('acceleration_z')
     for value in (0.0, 0.3):
@@ -207,7 +223,7 @@ def test_a_late_clock_of_mocap_is_measured_and_taken_out(tmp_path, late):
     seen, felt = turning(table.values['quaternion'], 0.01), table.values['angular_velocity']
     found, deviation = wander(seen, felt, np.ones(len(table), dtype=bool), 0.01)
     assert found == pytest.approx(late, abs=0.004) and deviation < 0.015
-    flight = TableFlight(table, model, None, body_keys(model))
+    flight, = load_tables([path], model, form)
     away = flight._seen[200:-200, 3:] - flight._measured[200:-200, -3:]
     assert not flight.apart and away.std() < 0.2 * felt.std()
 
@@ -216,10 +232,10 @@ def test_a_clock_that_wanders_takes_out_the_pair_and_not_the_flight(tmp_path):
     away = np.repeat(np.random.default_rng(5).normal(size=18) * 0.12, 200)
     paths = [write_flight(tmp_path / f'{k}.csv', 60 + k, scale=0.8, late=late)
              for k, late in enumerate((away, 0.02))]
-    result = table_results(paths[:1], [], 'nanobench', ROBOT)
+    result = gap_of(paths[:1], 'nanobench', ROBOT)
     assert result['groups']['force']['used'] and not result['groups']['rate']['used']
     assert 'wander by' in result['groups']['acceleration']['reason']
-    both = table_results(paths, [], 'nanobench', ROBOT)
+    both = gap_of(paths, 'nanobench', ROBOT)
     assert both['groups']['acceleration']['used'] and 'thrust_coefficient' in named(both)
     assert [text.split(':')[0] for text in both['findings']] == ['0.csv']
 
@@ -231,7 +247,7 @@ def test_what_a_format_lacks_is_listed_with_its_reason(tmp_path):
                     'duty: {columns: [pwm1, pwm2, pwm3, pwm4], full: 65535}\n'
                     'voltage: {columns: [vbat], unit: V}\n')
     flights = [write_flight(tmp_path / f'{k}.csv', 30 + k) for k in range(2)]
-    result = table_results(flights, [], str(form), ROBOT)
+    result = gap_of(flights, str(form), ROBOT)
     groups = result['groups']
     assert groups['force'] == {'used': True, 'channels': ['force_z'], 'reason': (
         'no specific force or acceleration along this axis')}
@@ -246,25 +262,25 @@ def test_flights_on_the_ground_and_other_channels_are_told_by_name(tmp_path):
     cells = [line.split(',') for line in lines]
     ground.write_text('\n'.join([lines[0], *(','.join([*c[:3], '0', *c[4:]])
                                              for c in cells[1:])]))
-    assert table_results([ground], [], 'nanobench', ROBOT)['verdict'] == 'bad_data'
-    result = table_results([good, ground], [], 'nanobench', ROBOT)
+    assert gap_of([ground], 'nanobench', ROBOT)['verdict'] == 'bad_data'
+    result = gap_of([good, ground], 'nanobench', ROBOT)
     assert result['findings'] == ['ground.csv: not used, no block of commands and measurements '
                                   'in the air']
     blind = tmp_path / 'blind.csv'
     blind.write_text('\n'.join([lines[0], *(','.join([*c[:8], '', *c[9:]]) for c in cells[1:])]))
     with pytest.raises(ParameterError, match='blind.csv: its channels are force_y'):
-        table_results([good, blind], [], 'nanobench', ROBOT)
+        gap_of([good, blind], 'nanobench', ROBOT)
 
 
 def test_duty_needs_a_robot_with_a_motor_map(tmp_path):
     flight = write_flight(tmp_path / 'a.csv', 1, seconds=5)
     with pytest.raises(ParameterError, match="'rotors.motor' is missing"):
-        table_results([flight], [], 'nanobench', None)
+        gap_of([flight], 'nanobench', None)
 
 
 @pytest.mark.timeout(600)
 def test_real_flights_name_thrust_and_drag_and_never_an_inertia():
-    result = table_results(sorted(REAL.glob('*.csv.gz')), [], 'nanobench', ROBOT)
+    result = gap_of(sorted(REAL.glob('*.csv.gz')), 'nanobench', ROBOT)
     assert {'thrust_coefficient', 'rotor_drag'} <= named(result)
     assert not {'inertia', 'torque_coefficient', 'wind'} & named(result)
     assert result['groups']['acceleration']['used'] and result['groups']['rate']['used']
@@ -276,4 +292,4 @@ def test_real_flights_name_thrust_and_drag_and_never_an_inertia():
 @pytest.mark.skipif(not BESIDE.is_dir(), reason='further flights are not beside the repository')
 def test_short_real_flights_name_no_inertia():
     flights = [BESIDE / f'nano_B2_circle_{name}_rep1.csv.gz' for name in ('slow', 'fast')]
-    assert 'inertia' not in named(table_results(flights, [], 'nanobench', ROBOT))
+    assert 'inertia' not in named(gap_of(flights, 'nanobench', ROBOT))

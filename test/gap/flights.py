@@ -3,21 +3,21 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from beetle_omni_ros.identify.flights.bag import BagFlight
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = replace(RobotParameters.load(), multibody=None)
 P = GapParameters.load()
 KEYS = {**all_keys(ROBOT), **extra_keys()}
 BODY = BodyModel(ROBOT, KEYS, (0.0, 0.0))
-RATE, STEP = 200, 0.005
+STEP = 0.005
+PLACE = {'B': slice(0, 6), 'A': slice(6, 9), 'W': slice(9, 12), 'J': slice(12, 16)}
 
 
 def waves(t, seed, width, size, highest=0.5):
@@ -92,23 +92,9 @@ class Motion:
                       np.column_stack([self.voltage, self.charge]))
 
 
-def gusts(motion, seed, size=0.1, lag=0.5):
-    """(N, 3) acceleration [m/s^2] by a coloured, independent force."""
-    keep = np.exp(-STEP / lag)
-    white = np.random.default_rng(seed).standard_normal((len(motion.t), 3))
-    return size * lfilter([np.sqrt(1 - keep**2)], [1, -keep], white, axis=0)
-
-
-def pushed(motion, push):
-    """Readings of an acceleration by the rotors' forces and ``push`` (N, 3) in world axes."""
-    thrust = np.einsum('ni,nij->nj', motion.thrust, motion.normals) / ROBOT.mass
-    force = thrust + motion.attitude.inv().apply(push)
-    return motion.flight(imu=np.concatenate([force, motion.rate], axis=1))
-
-
-def model(flight):
-    """FlightModel of a flight."""
-    return FlightModel(flight, ROBOT, BODY, KEYS, P)
+def model(flight, robot=ROBOT, body=BODY, keys=KEYS):
+    """The flight as the engine reads it."""
+    return BagFlight(flight, robot, body, keys, P)
 
 
 def solved(made, names, groups, base=None, start=None, iterations=3):
@@ -116,7 +102,7 @@ def solved(made, names, groups, base=None, start=None, iterations=3):
     Deviations of the named keys that minimise the residual.
 
     Args:
-        made: FlightModel.
+        made: BagFlight.
         names: fitted keys.
         groups: used groups of channels, such as 'BA'.
         base: group -> residual without any effect, which is subtracted.
@@ -126,10 +112,14 @@ def solved(made, names, groups, base=None, start=None, iterations=3):
     """
     theta = dict.fromkeys(names, 0.0) | (start or {})
     for _ in range(iterations):
-        r, s = made.residual(theta, groups), made.slopes(theta, list(names))
-        y = np.concatenate([(r[g] - (base[g] if base else 0.0)).ravel() for g in groups])
-        x = np.concatenate([s[g].reshape(-1, len(names)) for g in groups])
-        change = np.linalg.lstsq(x, -y, rcond=None)[0]
+        linear = made.linear(theta, list(names))
+        y, x = [], []
+        for group in groups:
+            own, counts = PLACE[group], made.mask[:, PLACE[group]]
+            y.append((linear.residual[:, own] - (base[group] if base else 0.0))[counts])
+            x.append(linear.slopes[:, own][counts])
+        change = np.linalg.lstsq(np.concatenate(x), -np.concatenate(y), rcond=None)[0]
         for name, step in zip(names, change, strict=True):
-            theta[name] = float(np.clip(theta[name] + step, KEYS[name].low, KEYS[name].high))
+            theta[name] = float(np.clip(theta[name] + step, made.keys[name].low,
+                                        made.keys[name].high))
     return theta

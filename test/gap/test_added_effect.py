@@ -4,17 +4,16 @@ from dataclasses import replace
 from pathlib import Path
 import re
 
-from flights import KEYS, Motion, P, ROBOT, solved
+from flights import model, Motion, P, ROBOT, solved
 import numpy as np
 import pytest
 from test_consumers import OUTPUTS, plain, with_effect
 from test_ingest import recording
 
+from beetle_omni_ros.identify.flights.priors import entries_of
 from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.ingest import prepare
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
-from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.robot import effects
 from beetle_omni_ros.robot.effects import CATALOGUE
 
@@ -55,16 +54,15 @@ def test_a_consumer_applies_the_added_effect_or_has_no_such_quantity(name, consu
 
 @pytest.mark.parametrize('name, values, value', [
     (HEAT, {'loss_per_kelvin': 0.0, 'temperature': 50.0}, 0.004), (FADE, {'loss': 0.0}, 0.1)])
-def test_the_gap_finder_identifies_the_added_effect(monkeypatch, name, values, value):
+def test_the_gap_finder_identifies_the_added_effect(name, values, value):
     robot = replace(ROBOT, effects={name: values})
     keys, key = {**all_keys(robot), **extra_keys()}, f'{name}.{next(iter(values))}'
-    monkeypatch.setitem(KEYS, key, keys[key])
-    made = FlightModel(Motion(duration=10.0).flight(), robot, BodyModel(robot, keys, (0.0, 0.0)),
-                       keys, P)
+    made = model(Motion(duration=10.0).flight(), robot, BodyModel(robot, keys, (0.0, 0.0)), keys)
     weak = made.residual({key: value}, 'B')
     assert np.abs(weak['B'] - made.residual({}, 'B')['B']).max() > 0.01
     assert solved(made, [key], 'B', base=weak)[key] == pytest.approx(value, rel=1e-6)
-    assert [c.keys for c in candidates(keys, [made]) if c.name == name] == [(key,)]
+    entry, = entries_of({n: own for n, own in keys.items() if own.effect == name and not own.form})
+    assert entry.keys == (key,)
 
 
 @pytest.mark.parametrize('current', ['negative', 'positive', 'partly unknown'])

@@ -8,8 +8,9 @@ from flights import ROBOT as PLAIN
 import numpy as np
 import pytest
 
+from beetle_omni_ros.identify.flights.priors import entries_of, Entry
+from beetle_omni_ros.identify.flights.results import parameters
 from beetle_omni_ros.identify.gap.apply import write_corrected
-from beetle_omni_ros.identify.gap.results import parameters
 from beetle_omni_ros.robot.effects import CATALOGUE, ignored
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -43,23 +44,38 @@ def test_by_default_only_named_effects_are_written(tmp_path):
     assert mine.sensors.imu_rotation == (0.01, 0.0, -0.02)
 
 
+def stated(entry, deviation=0.0, half=0.1, starts=None):
+    """Parameters of an entry whose keys were all found at ``deviation`` +- ``half``."""
+    count = len(entry.keys)
+    engine = SimpleNamespace(index={key: k for k, key in enumerate(entry.keys)},
+                             typical=np.full(count, 0.3))
+    posterior = SimpleNamespace(estimate=np.full(count, deviation),
+                                deviation=np.full(count, half / 1.96))
+    return parameters(entry, engine, list(range(count)), posterior, KEYS, starts or {})
+
+
 @pytest.mark.parametrize('name, deviation, expected', [
     ('rotor_drag.coefficient', 0.03, [0.0, 0.13]), ('axial_inflow.per_rotor', 0.4, [0.3, 0.5])])
 def test_intervals_exclude_impossible_values(name, deviation, expected):
-    a = SimpleNamespace(keys=KEYS, widths={name: 0.1})
     entry, parameter = name.split('.')
-    found = parameters(a, entry, (name,), {name: deviation}, PLAIN)[parameter]
+    found = stated(Entry(entry, (name,)), deviation)[parameter]
     assert found['interval'] == pytest.approx(expected) and found['file'] == 0.0
 
 
 @pytest.mark.parametrize('name', [n for n in CATALOGUE if not ignored('gap', n)])
 def test_every_entry_states_each_of_its_parameters(name):
-    own = {key.name: key for key in KEYS.values() if key.effect == name}
-    member = 1 if CATALOGUE[name].each else None
-    free = tuple(key for key in own if member is None or key.endswith(f'[{member - 1}]')) or \
-        tuple(own)
-    a = SimpleNamespace(keys=KEYS, widths=dict.fromkeys(own, 0.1))
-    stated = parameters(a, name, free, dict.fromkeys(own, 0.0), PLAIN)
-    assert list(stated) == list(CATALOGUE[name].parameters)
-    for entry in stated.values():
-        assert set(entry) == {'value', 'unit', 'file', 'interval'}
+    own = {n: key for n, key in KEYS.items() if key.effect == name and not key.form}
+    for entry in entries_of(own):
+        found = stated(entry)
+        assert list(found) == list(CATALOGUE[name].numbers)
+        for value in found.values():
+            assert set(value) == {'value', 'unit', 'file', 'interval', 'typical'}
+
+
+def test_a_limit_is_stated_from_the_start_at_which_it_acts():
+    start = {'joint_velocity_limit.velocity_limit': np.log(0.5)}
+    entry = Entry('joint_velocity_limit', ('joint_velocity_limit@0',))
+    found = stated(entry, 1.0, 0.2, {'joint_velocity_limit@0': start})['velocity_limit']
+    limit = PLAIN.joints.velocity_limit
+    assert found['value'] == pytest.approx(0.5 * limit)
+    assert found['interval'] == pytest.approx([0.5**1.2 * limit, 0.5**0.8 * limit])

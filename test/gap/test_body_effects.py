@@ -1,12 +1,10 @@
 """Each body effect, added to the readings by an independent formula, is recovered."""
 
-
 from flights import KEYS, model, Motion, ROBOT, solved
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.identify.gap.residual import THIN
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 MOTION = Motion()
@@ -151,7 +149,7 @@ def without(made, force, torque):
     more = np.concatenate([np.broadcast_to(force, size) / ROBOT.mass,
                            np.broadcast_to(torque, size) / ROBOT.inertia], axis=1)
     seen = np.stack([np.interp(made.signals.t, MOTION.t, column) for column in more.T], axis=1)
-    return {'B': made.residual({}, 'B')['B'] - made.filters['B'](seen[::THIN])}
+    return {'B': made.residual({}, 'B')['B'] - seen[made.rows]}
 
 
 @pytest.mark.parametrize('name', list(CASES))

@@ -2,13 +2,12 @@
 
 from dataclasses import replace
 
-from flights import BODY, KEYS, model, Motion, P, ROBOT, solved, STEP
+from flights import BODY, model, Motion, PLACE, ROBOT, solved, STEP
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, names_of
-from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.robot.effects import CATALOGUE, ignored
 
 MOTION = Motion(5)
@@ -17,6 +16,10 @@ NEUTRAL = dict(model(MOTION.flight()).residual({}).items())
 
 def readings():
     return np.concatenate([MOTION.specific_force, MOTION.rate], axis=1)
+
+
+def slopes_of(made, names):
+    return made.linear({}, names).slopes[:, PLACE['J']]
 
 
 def recovered(flight, names, groups):
@@ -75,9 +78,9 @@ def test_a_fit_begins_at_the_sensor_effects_of_the_robot_file(name):
     known = replace(ROBOT, effects={name: {parameter: (np.array(spec.neutral)
                                                        + spec.typical).tolist()}})
     keys = {**all_keys(known), **extra_keys()}
-    given = FlightModel(MOTION.flight(), known, BODY, keys, P).residual({})
+    given = model(MOTION.flight(), known, BODY, keys).residual({})
     theta = dict.fromkeys(names_of(name, parameter), spec.typical)
-    fitted = FlightModel(MOTION.flight(), ROBOT, BODY, KEYS, P).residual(theta)
+    fitted = model(MOTION.flight()).residual(theta)
     for group in given:
         assert given[group] == pytest.approx(fitted[group], abs=1e-9)
     assert keys[names_of(name, parameter)[0]].value(0.0) == pytest.approx(spec.typical)
@@ -103,8 +106,8 @@ def rms(x):
 
 @pytest.mark.parametrize('name', [DELAY, 'imu_filter_lag.delay'])
 def test_derivatives_by_a_delay_contain_no_encoder_noise(name):
-    slopes = [model(noisy(tilt)).slopes({}, [name])['J'] for tilt in (0.0, 0.02)]
-    clean = model(noisy()).slopes({}, [DELAY])['J']
+    slopes = [slopes_of(model(noisy(tilt)), [name]) for tilt in (0.0, 0.02)]
+    clean = slopes_of(model(noisy()), [DELAY])
     assert rms(slopes[1] - slopes[0]) < 0.02 * rms(clean)
 
 
@@ -127,7 +130,7 @@ def test_tilts_follow_the_servo_model_if_encoders_are_noisy():
 @pytest.mark.parametrize('gain', ['kp', 'kd'])
 def test_derivatives_by_the_gain_of_a_servo_agree_with_its_joint(gain):
     made, own = model(MOTION.flight()), [f'servo.{gain}[{k}]' for k in range(4)]
-    slopes, h = made.slopes({}, [f'joint_bandwidth.{gain}', *own])['J'], 0.01
+    slopes, h = slopes_of(made, [f'joint_bandwidth.{gain}', *own]), 0.01
     for k, name in enumerate(own):
         moved = (made.residual({name: h}, 'J')['J'] - made.residual({}, 'J')['J']) / h
         assert np.abs(moved[:, k]).max() > 1e-3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.flights.bag import BagFlight
-from beetle_omni_ros.identify.flights.bag_command import judged
+from beetle_omni_ros.identify.flights.bag_verdict import judged
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.ingest import load_flight
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys

@@ -1,31 +1,38 @@
-"""The campaign from cases to report, with replacements of the workflow."""
+"""The campaign from cases to report, with a replacement of the tool."""
 
 import ast
 from dataclasses import replace
 import json
-import os
 from pathlib import Path
+import sys
 
-from gap_data.campaign import make_report, run_campaign
+from gap_data.campaign import run_campaign
 from gap_data.cases import Case, GENERATOR
 from gap_data.make import make_case
 from gap_data.page import markdown
-from gap_data.workflow import Workflow
+from gap_data.score import score
 import pytest
 
-META = {'set': 'test', 'seed': 0, 'cases': 2, 'command_age': 0.01, 'command': 'none'}
 STUB = """
-import json, os, sys
-def run_gap(runs, holdout, robot, apply, json_path, page, console):
-    assert all((run / 'metadata.yaml').is_file() for run in [*runs, *holdout])
-    assert robot.read_text().startswith('#') and len(runs) == 2 and len(holdout) == 1
-    names = {names}
-    json_path.write_text(json.dumps({{
-        'verdict': 'named' if names else 'no_gap', 'closure': 0.9, 'where': [], 'candidates': [],
-        'effects': [{{'names': [n], 'evidence': {{}}, 'parameters': {{'mass': {{
-            'value': 3.3, 'unit': 'kg', 'interval': [3.2, 3.5]}}}}}} for n in names],
-        'gap_before': 2.0, 'gap_after': 1.0, 'noise_floor': 1.0, 'next_experiment': None}}))
-    return 0
+import json, pathlib, sys
+words = iter(sys.argv[1:])
+assert next(words) == 'gap'
+given, place = {{'runs': []}}, 'runs'
+for word in words:
+    if word.startswith('--'):
+        place = word[2:]
+    else:
+        given.setdefault(place, []).append(word)
+assert all(pathlib.Path(run, 'metadata.yaml').is_file()
+           for run in given['runs'] + given['holdout'])
+assert pathlib.Path(*given['robot']).read_text().startswith('#')
+assert len(given['runs']) == 2 and len(given['holdout']) == 1
+names = {names}
+pathlib.Path(*given['json']).write_text(json.dumps({{
+    'verdict': 'named' if names else 'no_gap', 'closure': 0.9, 'where': [], 'candidates': [],
+    'effects': [{{'names': [n], 'evidence': {{}}, 'parameters': {{'mass': {{
+        'value': 3.3, 'unit': 'kg', 'interval': [3.2, 3.5]}}}}}} for n in names],
+    'gap_before': 2.0, 'gap_after': 1.0, 'noise_floor': 1.0, 'next_experiment': None}}))
 """
 SMALL = Case('singles', 'hard', 3, (('mass', 0.3, 'plain'),), course='slow', duration=2.0,
              multibody=True, gust=True, tolerance=True, command_age=0.01)
@@ -34,17 +41,6 @@ SMALL = Case('singles', 'hard', 3, (('mass', 0.3, 'plain'),), course='slow', dur
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp('campaign')
-
-
-@pytest.fixture
-def stub(tmp_path, monkeypatch):
-    def make(names):
-        name = 'stub_' + '_'.join(names or ['nothing'])
-        (tmp_path / f'{name}.py').write_text(STUB.format(names=names))
-        monkeypatch.setenv('PYTHONPATH', f'{tmp_path}{os.pathsep}'
-                           + os.environ.get('PYTHONPATH', ''))
-        return name
-    return make
 
 
 def test_a_case_is_generated_once_and_reproducibly(folder, tmp_path):
@@ -61,22 +57,22 @@ def test_a_case_is_generated_once_and_reproducibly(folder, tmp_path):
     assert not [p for p in first.rglob('*') if p.suffix == '.json']
 
 
-def test_a_campaign_scores_workflows_side_by_side(folder, stub):
+def test_a_campaign_keeps_and_scores_the_answers_of_a_tool(folder, tmp_path):
     none = replace(SMALL, kind='none', effects=())
-    right, silent = stub(['mass']), stub([])
-    workflows = [Workflow('right', f'{right}:run_gap'), Workflow('silent', f'{silent}:run_gap')]
-    seen = []
-    judged = run_campaign([SMALL, none], workflows, folder,
-                          done=lambda case, name, j, kept: seen.append((name, kept)))
-    assert [j['right'] for j in judged['right']] == [True, False]
-    assert [j['right'] for j in judged['silent']] == [False, True]
-    assert judged['right'][1]['wrong'] == [['mass']]
-    assert judged['right'][0]['parameters'][0]['inside'] == [True]
-    assert len(seen) == 4 and not any(kept for _, kept in seen)
-    run_campaign([SMALL, none], workflows, folder, done=lambda c, n, j, kept: seen.append(
-        (n, kept)))
-    assert all(kept for _, kept in seen[4:])
-    report = json.loads(json.dumps(make_report(judged, META)))
+    judged, seen = {}, []
+    for names in (['mass'], []):
+        (tmp_path / 'stub.py').write_text(STUB.format(names=names))
+        judged[bool(names)] = run_campaign(
+            [SMALL, none], f'{sys.executable} {tmp_path}/stub.py', folder, version=str(names),
+            done=lambda case, j: seen.append(j['wall_s']))
+    assert [j['right'] for j in judged[True]] == [True, False]
+    assert [j['right'] for j in judged[False]] == [False, True]
+    assert judged[True][1]['wrong'] == [['mass']]
+    assert judged[True][0]['parameters'][0]['inside'] == [True]
+    (tmp_path / 'stub.py').unlink()
+    assert run_campaign([SMALL, none], f'{sys.executable} {tmp_path}/stub.py', folder,
+                        version='[]') == judged[False]
+    report = json.loads(json.dumps({'meta': {'cases': 2, 'command': 'x'}, **score(judged[True])}))
     assert '| none: false alarm | <= 0.05 |' in markdown(report)
 
 

@@ -119,3 +119,18 @@ def _called(function, inputs, vector, result):
     buffer.set_res(0, memoryview(result))
     evaluate()
     return result
+
+
+def tilting_modules(robot: RobotParameters) -> tuple[float, float]:
+    """Inertia about the joint [kg m^2] and mass moment [kg m] of a module of the file."""
+    if robot.multibody is None:
+        return 0.0, 0.0
+    module = robot.multibody.module
+    depth = -float(module.centre_of_mass[2])
+    return float(module.inertia[0] + module.mass * depth**2), float(module.mass * depth)
+
+
+def swing_of(robot: RobotParameters) -> float:
+    """Logarithm of the ratio of a module's inertia about its joint and the servo's inertia."""
+    inertia = tilting_modules(robot)[0]
+    return float(np.log(max(inertia / robot.joints.inertia, 1.0))) if inertia else 0.0

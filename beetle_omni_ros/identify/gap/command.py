@@ -1,127 +1,152 @@
-"""`beetle_omni gap`: from recorded flights to verdict, numbers, page and corrected robot file."""
+"""`beetle_omni gap`: from recordings to verdict, numbers, page and corrected robot file."""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from threadpoolctl import threadpool_limits
 
-from beetle_omni_ros.identify.gap.analysis import analyse, Analysis
+from beetle_omni_ros.identify.flights.bag_verdict import judged
+from beetle_omni_ros.identify.flights.page import gap_page
+from beetle_omni_ros.identify.flights.results import ALPHA, result_of
+from beetle_omni_ros.identify.flights.table import Format
+from beetle_omni_ros.identify.flights.table_verdict import judged_tables, load_tables
+from beetle_omni_ros.identify.flights.text import grids, headline
 from beetle_omni_ros.identify.gap.apply import write_corrected
 from beetle_omni_ros.identify.gap.bags import read_recording
 from beetle_omni_ros.identify.gap.ingest import (
     check_apart,
     check_flights,
+    Flight,
     load_flight,
     UnusableFlight,
 )
-from beetle_omni_ros.identify.gap.page import gap_page
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.results import grids, headline, results
-from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.robot_file import check_differs
 from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_log
 from beetle_omni_ros.identify.servo.page import change_grids, gap_log_page
 from beetle_omni_ros.pages.page import print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import names_of, runs_in
 from beetle_omni_ros.runs.files import write_json, write_text
 
 BAD_DATA = 3        # exit status
-LEAST_FITTED = 2    # with more flights, the last one is held out if none is given
+LEAST_FITTED = 2    # bags; with more, the last one is held out if none is given
 
 
-def run_gap(runs: list[Path], holdout: Sequence[Path] = (), robot: Path | None = None,
-            apply: Path | None = None, json_path: Path | None = None, page: Path | None = None,
-            console: Console | None = None, parameters: Path | None = None,
-            fix: bool = False, tolerances: bool = False) -> int:
+def run_gap(*args, **options) -> int:
+    """Exit status of :func:`gap_results`: 3 for the verdict `bad_data`, else 0."""
+    return BAD_DATA if gap_results(*args, **options)['verdict'] == 'bad_data' else 0
+
+
+def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path | None = None,
+                apply: Path | None = None, json_path: Path | None = None,
+                page: Path | None = None, console: Console | None = None,
+                parameters: Path | None = None, fix: bool = False, tolerances: bool = False,
+                form: str | None = None, alpha: float = ALPHA) -> dict:
     """
-    Find differences between model and measurement.
+    Find differences between model and measurement; arguments of `beetle_omni gap`.
 
-    Arguments are those of `beetle_omni gap`.
+    Args:
+        runs: bags, joint logs, or tables of flights.
+        holdout: flights that only judge; by default the last of three bags or more.
+        robot: robot file; None: the shipped one.
+        apply: robot file to write, with the named effects.
+        json_path: file of the results.
+        page: HTML page to write.
+        console: for progress, sentence and tables.
+        parameters: file with changes to params/gap.yaml.
+        fix: whether certain corrections of bags are applied.
+        tolerances: whether ``apply`` has this robot's own numbers, too.
+        form: format of tables of flights, by name or file; None: bags or joint logs.
+        alpha: probability of a false alarm that is accepted.
 
     Returns:
-        exit status: 3 for the verdict `bad_data`, else 0.
+        the results that are written as JSON.
 
     Raises:
         BagError: a run does not exist or is no recording of this robot.
-        ParameterError, LogError: unusable robot file, log or output, or the same run twice.
+        ParameterError, LogError: unusable file or value, or the same run twice.
 
     """
-    result = gap_results(runs, holdout, robot, apply, json_path, page, console, parameters, fix,
-                         tolerances)
-    return BAD_DATA if result['verdict'] == 'bad_data' else 0
-
-
-def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=None,
-                console=None, parameters=None, fix=False, tolerances=False) -> dict:
-    """As :func:`run_gap`, but return the results that it writes as JSON."""
     console = console or Terminal()
-    runs, holdout = runs_in(runs), runs_in(holdout)
+    if not 0 < alpha < 1:
+        raise ParameterError(f'--alpha {alpha:g}: expected a probability between 0 and 1')
+    if form is not None and fix:
+        raise ParameterError('--fix: expected without --format, because it corrects bags')
     check_differs(apply, robot)
+    model, p = RobotParameters.load(robot), GapParameters.load(parameters)
+    runs, holdout = (list(given) if form else runs_in(given) for given in (runs, holdout))
     check_apart([*runs, *holdout])
-    robot_parameters, p = RobotParameters.load(robot), GapParameters.load(parameters)
-    if any(is_joint_log(run) for run in runs):
+    if form is None and any(is_joint_log(run) for run in runs):
         with console.status('comparing the servos'):
-            result, apart = analyse_joint_logs(runs, holdout, robot_parameters, robot)
+            result, apart = analyse_joint_logs(runs, holdout, model, robot)
         html = gap_log_page(apart, result, [*grids(result), *change_grids(result['changes'])],
-                            robot_parameters) if page else ''
+                            model) if page else ''
     else:
-        meta = {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
-                'robot': str(robot) if robot else 'params/robot.yaml'}
-        with Progress(SpinnerColumn(), TextColumn('{task.description}'), TimeElapsedColumn(),
-                      console=console, transient=True) as bars:
-            bar = bars.add_task('reading')
-            a = _analysed(runs, holdout, robot_parameters, p, fix,
-                          lambda text: bars.update(bar, description=text))
-        result = results(a, robot_parameters, p, meta)
-        if page and a.damages:      # workers return only the damages, so the bag is read again
-            given = [*runs, *holdout]
-            path = given[names_of(given).index(a.damages[0].run)]
-            a.damaged = read_recording(path), a.damages[0]
-        html = gap_page(a, result) if page else ''
+        # On small matrices, several threads only take more CPU time.
+        with console.status('reading') as status, threadpool_limits(1):
+            result = _tables(runs, holdout, model, p, form, alpha, status.update) if form \
+                else _bags(runs, holdout, model, p, fix, alpha, status.update)
+        result['meta'] |= {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
+                           'robot': str(robot) if robot else 'params/robot.yaml', 'alpha': alpha}
+        html = gap_page(result, _damaged(result, [*runs, *holdout])) if page else ''
     write_json(json_path, result)
     if page:
         write_text(page, html, 'page')
     if apply and result['effects']:
-        write_corrected(apply, result, robot_parameters, robot, tolerances)
-    _print(console, result)
-    if apply:
-        console.print(f'corrected robot: {apply}' if result['effects'] else
-                      'no effect is named: no robot file is written', highlight=False)
+        write_corrected(apply, result, model, robot, tolerances)
+    _print(console, result, apply)
     return result
 
 
-def _analysed(runs, holdout, robot, p, fix, progress):
+def _tables(runs, holdout, robot, p, form, alpha, progress):
+    declared = Format.load(form)
+    flights, judging = (load_tables(paths, robot, declared) for paths in (runs, holdout))
+    result = judged_tables(flights, judging, robot, p, declared, alpha, progress)
+    result['meta']['format'] = declared.name
+    return result
+
+
+def _bags(runs, holdout, robot, p, fix, alpha, progress):
     given = [*runs, *holdout]
-    with Workers() as workers:
-        flights = workers.map(_loaded, zip(given, names_of(given), strict=True), robot, p, fix)
-    unusable = [flight for flight in flights if isinstance(flight, UnusableFlight)]
-    if unusable:
+    flights, damages = [], []
+    for path, name in zip(given, names_of(given), strict=True):
+        try:
+            flights.append(load_flight(path, robot, p, fix, name))
+        except UnusableFlight as error:
+            damages.append((error, error.problems))
+    if damages:
         # A verdict from the other flights would be read as one from all of them.
-        return Analysis('bad_data', str(unusable[0]),
-                        damages=[damage for f in unusable for damage in f.problems])
+        return result_of('bad_data', {}, str(damages[0][0]), bad_data=[
+            {'run': d.run, 'topic': d.topic, 'cause': d.cause, 'at_s': d.at_s, 'sure': d.sure,
+             'fix': d.fix} for _, problems in damages for d in problems])
     check_flights(given, flights, p.same_flight)
     fitted, judging = flights[:len(runs)], flights[len(runs):]
     if not judging and len(fitted) > LEAST_FITTED:
         fitted, judging = fitted[:-1], fitted[-1:]
-    a = analyse(fitted, judging, robot, p, progress)
-    a.findings = [text for flight in flights for text in flight.findings] + a.findings
-    return a
+    progress('weighing effects')
+    result = judged(fitted, judging, robot, p, alpha)
+    result['findings'] += _findings(flights)
+    return result
 
 
-def _loaded(_, named, robot, p, fix):
-    """A flight, or the error that makes it unusable."""
-    path, name = named
-    try:
-        return load_flight(path, robot, p, fix, name)
-    except UnusableFlight as error:
-        return error
+def _findings(flights: list[Flight]) -> list[str]:
+    return [text for flight in flights for text in flight.findings]
 
 
+def _damaged(result, given):
+    """Recording of the first damage and that damage, or None."""
+    if not result['bad_data']:
+        return None
+    first = result['bad_data'][0]
+    return read_recording(given[names_of(given).index(first['run'])]), first
 
 
-def _print(console, result):
+def _print(console, result, apply):
     console.print(headline(result), style='bold', highlight=False, markup=False)
     console.print(result['summary'], highlight=False, markup=False)
     for finding in dict.fromkeys(result['findings']):
@@ -129,3 +154,6 @@ def _print(console, result):
     print_grids([*grids(result), *change_grids(result.get('changes', []))], console)
     if result['next_experiment']:
         console.print(f"Next: {result['next_experiment']}", highlight=False, markup=False)
+    if apply:
+        console.print(f'corrected robot: {apply}' if result['effects'] else
+                      'no effect is named: no robot file is written', highlight=False)

@@ -1,6 +1,7 @@
 """From a recording to a checked flight, or the reason why it is unusable."""
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 import hashlib
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, OPTIONAL, read_recording, Recording
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.series import aligned, shortest_flight
+from beetle_omni_ros.identify.gap.series import aligned
 from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.clocks import begin_of
 from beetle_omni_ros.identify.recording.damage import Damage
@@ -17,6 +18,8 @@ from beetle_omni_ros.identify.recording.flown import flown
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import bag_files
+
+TABLES = ('.csv', '.gz')     # endings of files that are no bags
 
 
 class UnusableFlight(ValueError):
@@ -28,17 +31,9 @@ class UnusableFlight(ValueError):
 
     """
 
-    def __init__(self, text: str, problems: list[Damage] | tuple = ()):
-        # The error is sent to the parent process, and functions cannot be pickled.
-        super().__init__(text, [replace(damage, repair=None) for damage in problems])
-
-    @property
-    def problems(self) -> list[Damage]:
-        """See the class."""
-        return self.args[1]
-
-    def __str__(self) -> str:
-        return self.args[0]
+    def __init__(self, text: str, problems: Sequence[Damage] = ()):
+        super().__init__(text)
+        self.problems = list(problems)
 
 
 @dataclass
@@ -133,10 +128,9 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
     t = series['command'][0]
     begin, end = t[0] + lead, t[-1]
     begin, end = _without_gaps(name, series, begin, end, p, findings, origin)
-    least = max(p.least_duration, shortest_flight(p))
-    if end - begin < least:
+    if end - begin < p.least_duration:
         raise _unusable(name, 'all topics', f'{max(end - begin, 0.0):.1f} s of usable flight, '
-                        f'{least:.3g} s are needed')
+                        f'{p.least_duration:.3g} s are needed')
     cut = {}
     for topic, (t, values) in series.items():
         keep = (t > begin - 1.0) & (t < end + 0.5)
@@ -244,7 +238,7 @@ def check_apart(runs: list[Path]) -> None:
     """
     known: dict[tuple, Path] = {}
     for run in runs:
-        files = [run] if run.suffix.lower() == '.csv' else bag_files(run)
+        files = [run] if run.suffix.lower() in TABLES else bag_files(run)
         if not all(file.is_file() for file in files):
             continue        # reading it raises the error
         size = tuple(file.stat().st_size for file in files)

@@ -44,7 +44,6 @@ class Key:
         groups: channel groups that depend on it.
         body: whether it is in the body equations, not in a signal.
         step: step of finite differences.
-        curved: whether slopes change considerably along a fit.
         form: whether it selects a form and is not fitted.
 
     """
@@ -62,16 +61,11 @@ class Key:
     groups: str
     body: bool = False
     step: float = 1e-3
-    curved: bool = False
     form: bool = False
 
     def value(self, deviation: float) -> float:
         """Catalogue value of a deviation."""
         return self.base * math.exp(deviation) if self.relative else self.base + deviation
-
-    def width(self, deviation: float, half: float) -> float:
-        """Half width in the catalogue's unit."""
-        return half * abs(self.value(deviation)) if self.relative else half
 
     @property
     def ends_at_none(self) -> bool:
@@ -138,19 +132,13 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
                                  float(value), relative, low, high,
                                  0.5 if math.isnan(spec.typical) else spec.typical,
                                  0.0 if math.isnan(spec.smallest) else spec.smallest,
-                                 groups, effect.apply is not None, spec.step, spec.curved,
+                                 groups, effect.apply is not None, spec.step,
                                  spec.form)
     return keys
 
 
-def tolerances(p: GapParameters, coarse: bool = False,
-               swing: float = 0.0) -> dict[str, Prior]:
-    """
-    Priors of the keys by which every robot differs from the robot file.
-
-    Sensors with ``coarse`` noise have an unknown latency. ``swing`` is the logarithm of the factor
-    by which a servo's inertia may exceed that of the file.
-    """
+def tolerances(p: GapParameters) -> dict[str, Prior]:
+    """Priors of the keys by which every robot differs from the robot file."""
     result = {key: getattr(p, f'tolerance_{spec.tolerance}')
             for name, effect in CATALOGUE.items() for parameter, spec in effect.parameters.items()
             if spec.tolerance for key in names_of(name, parameter)}
@@ -160,20 +148,7 @@ def tolerances(p: GapParameters, coarse: bool = False,
                    f'servo.kd[{k}]': p.tolerance_lag}
     for k in range(12):
         result[f'position.offset[{k}]'] = p.tolerance_position
-    priors = {name: Prior(deviation) for name, deviation in result.items()}
-    priors['imu_filter_lag.delay'] = Prior(p.tolerance_delay, 0.0, p.imu_averaging, 0.002)
-    reach, nominal = p.command_delay_range, p.command_delay
-    for bus in (TILT_BUS, THRUST_BUS):
-        priors[bus] = Prior(5e-4, nominal, reach / 2, p.bus_near[0])
-    near = p.tolerance_swing
-    priors['swing.ratio'] = Prior(p.tolerance_lag, near, max(swing, near), swing + near)
-    if coarse:
-        imu, joint = p.coarse_latency
-        priors['imu_filter_lag.delay'] = Prior(p.tolerance_delay, 0.0, imu, imu)
-        priors['joint_feedback_delay.delay'] = Prior(p.tolerance_delay, 0.0, joint, joint)
-        for bus in (TILT_BUS, THRUST_BUS):
-            priors[bus] = Prior(5e-4, nominal, reach / 2, p.bus_near[1])
-    return priors
+    return {name: Prior(deviation) for name, deviation in result.items()}
 
 
 def extra_keys() -> dict[str, Key]:
@@ -192,7 +167,7 @@ def extra_keys() -> dict[str, Key]:
     for k in range(4):
         add(f'rotor.lag[{k}]', k, 1, 0.1, 'B', step=0.02)
         for gain in ('kp', 'kd'):
-            add(f'servo.{gain}[{k}]', k, 1, 0.3, 'J', step=0.01, curved=True)
+            add(f'servo.{gain}[{k}]', k, 1, 0.3, 'J', step=0.01)
     for name in (TILT_BUS, THRUST_BUS):
-        add(name, None, 0.05, 0.005, 'BJ', curved=True, parameter='delay')
+        add(name, None, 0.05, 0.005, 'BJ', parameter='delay')
     return keys

@@ -15,10 +15,10 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import delays_of, Key
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.series import channel_filters, matrices, THIN
 from beetle_omni_ros.identify.gap.servo import simulate, targets_at, windows_at
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import NUMPY, Servo
 
 CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torque_z'),
             'A': ('acceleration_x', 'acceleration_y', 'acceleration_z'),
@@ -35,7 +35,9 @@ BOTH_SIDES = 'delay'
 
 class FlightModel:
     """
-    Residuals of one flight at any deviations; all flights share the body equations.
+    Signals, body equations and servos of one flight; all flights share the body equations.
+
+    A subclass defines the residual and the filter of the joints.
 
     Attributes:
         modules: share of the file's tilting modules in the model, 0 or 1; fits vary it around
@@ -49,17 +51,16 @@ class FlightModel:
         self.flight, self.robot, self.keys, self.p, self._body = flight, robot, keys, p, body
         self.modules = 0.0
         self.signals = Signals(flight, robot, p)
-        self.filters = channel_filters(p)
         self._length = round(p.servo_window / p.grid)
         count = len(self.signals.t) - round(p.servo_warm_up / p.grid) - 1
         self._starts = np.arange(0, count - self._length + 1, self._length) \
             + round(p.servo_warm_up / p.grid)
         self._cache: dict[tuple, tuple] = {}      # of _windows
         self._last: tuple = (None, {})      # point of the last residual, and the residual by group
-        self._mask = self._trusted()
+        self.trusted = self._trusted()
 
     def _trusted(self):
-        """(M,) 0 for body samples at the rotor limit for the voltage or on the ground, else 1."""
+        """(N,) whether a grid point is not at the rotor limit for its voltage, nor grounded."""
         s, p = self.signals, self.p
         bad = s.pose({})[0][:, 2] < p.contact_height
         rows = sorted(self.robot.rotors.map, key=lambda row: row.voltage)
@@ -73,18 +74,7 @@ class FlightModel:
         # Rotor lag: a limit also affects the following samples.
         memory = round(5 * self.robot.rotors.time_constant / p.grid)
         spread = np.convolve(bad, np.ones(memory))[:len(bad)] > 0
-        self.trusted = ~spread
-        near = THIN * self.filters['B'].margin
-        wide = np.convolve(spread, np.ones(2 * near + 1), 'same') > 0
-        return (~wide[::THIN][self.filters['B'].centres(-(-len(s.t) // THIN))]).astype(float)
-
-    def times(self, group: str) -> np.ndarray:
-        """(M,) times of a group's samples [s], relative to the flight's start."""
-        if group == 'J':
-            first, count = self._starts[0], self._length * len(self._starts)
-            return self.signals.t[first + self.filters['J'].centres(count)]
-        t = self.signals.t[::THIN] if group == 'B' else self.signals.t
-        return t[self.filters[group].centres(len(t))]
+        return ~spread
 
     def inputs(self, theta: dict[str, float]) -> dict[str, np.ndarray]:
         """Inputs (N, width) of the body equations."""
@@ -99,9 +89,6 @@ class FlightModel:
                 'charge': s.charge,
                 'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0))}
 
-    def _thinned(self, theta):
-        return {name: values[::THIN] for name, values in self.inputs(theta).items()}
-
     def residual(self, theta: dict[str, float], groups: str = 'BAWJ') -> dict[str, np.ndarray]:
         """Group -> (M, channels) measured minus expected."""
         point = (self.modules, theta)
@@ -111,44 +98,13 @@ class FlightModel:
         result.update(self._residual(theta, ''.join(g for g in groups if g not in result)))
         return {group: result[group] for group in groups}
 
-    def _residual(self, theta, groups):
+    def _residual(self, theta: dict[str, float], groups: str) -> dict[str, np.ndarray]:
         """As :meth:`residual`, without the cache."""
-        result = {}
-        if 'B' in groups:
-            force, _, turning = self.signals.imu(theta)
-            expected = self._body(self._thinned(theta), theta)
-            result['B'] = self._mask[:, None] * self.filters['B'](
-                np.concatenate([force, turning], axis=1)[::THIN] - expected)
-        if 'A' in groups:
-            result['A'] = self._world(theta)
-        if 'W' in groups:
-            result['W'] = self._rates(theta)
-        if 'J' in groups:
-            result['J'] = self._joints([theta])[0]
-        return result
+        raise NotImplementedError
 
-    def _world(self, theta):
-        """IMU's acceleration in world less MoCap's (M, 3)."""
-        force, _, _ = self.signals.imu(theta)
-        position, quaternion, _ = self.signals.pose(theta)
-        world = np.einsum('nij,nj->ni', matrices(quaternion), force)
-        world[:, 2] -= self.robot.gravity
-        kernel = self.filters['A']
-        return kernel(world) - kernel(position, 2)
-
-    def _rates(self, theta):
-        """Gyroscope's rates less MoCap's (M, 3)."""
-        _, rate, _ = self.signals.imu(theta)
-        _, quaternion, _ = self.signals.pose(theta)
-        rotation = matrices(quaternion)
-        h = self.p.grid
-        change = np.empty_like(rotation)
-        change[1:-1] = (rotation[2:] - rotation[:-2]) / (2 * h)
-        change[0], change[-1] = change[1], change[-2]
-        skew = np.einsum('nji,njk->nik', rotation, change)
-        seen = np.stack([skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0],
-                         skew[:, 1, 0] - skew[:, 0, 1]], axis=1) / 2
-        return self.filters['W'](rate - seen)
+    def _of_joints(self, series: np.ndarray) -> np.ndarray:
+        """Filtered and thinned series (N, 4) of the joints."""
+        raise NotImplementedError
 
     def _joints(self, sets):
         """Encoders minus simulated servos, [(M, 4)] for each set."""
@@ -163,9 +119,6 @@ class FlightModel:
                 read = self.signals.joints(sets[k])[3][first:first + count]
                 residuals[k] = self._of_joints(read - run.reshape(-1, 4))
         return residuals
-
-    def _of_joints(self, series):
-        return self.filters['J'](series)
 
     def smooth_tilts(self, theta: dict[str, float]) -> None:
         """
@@ -238,31 +191,29 @@ class FlightModel:
         index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
         return windows_at(s, theta, index, (tilt[at], rate[at]), s.thrust({})[0], skip), edges
 
-    def slopes(self, theta: dict[str, float], names: list[str]) -> dict[str, np.ndarray]:
-        """Group -> (M, channels, len(names)): derivative of the residual by each key."""
-        result = {group: np.zeros((len(self.times(group)), len(channels), len(names)))
-                for group, channels in CHANNELS.items()}
-        body = [name for name in names if self.keys[name].body]
-        if body:
-            exact = self._body.derivatives(self._thinned(theta), theta, tuple(body))
-            smooth = -self._mask[:, None, None] * self.filters['B'](exact)
-            for k, name in enumerate(body):
-                result['B'][:, :, names.index(name)] = smooth[:, :, k]
-        signal = {name: self.keys[name].groups.replace('J', '') for name in names
-                  if not self.keys[name].body}
-        now = self.residual(theta, ''.join(dict.fromkeys(''.join(signal.values()))))
-        for name, groups in signal.items():
-            h = self.keys[name].step
-            h = -h if theta.get(name, 0.0) + h > self.keys[name].high else h
-            if groups:
-                here, other, width = theta.get(name, 0.0), now, h
-                if self.keys[name].parameter == BOTH_SIDES:
-                    other, width = self._residual({**theta, name: here - h}, groups), 2 * h
-                moved = self._residual({**theta, name: here + h}, groups)
-                for group, values in moved.items():
-                    result[group][:, :, names.index(name)] = (values - other[group]) / width
-        turning = [name for name in names if 'J' in self.keys[name].groups]
-        if turning:
-            for name, slope in zip(turning, self._joint_slopes(theta, turning), strict=True):
-                result['J'][:, :, names.index(name)] = slope
-        return result
+
+def limit_starts(key, effect, models):
+    """Starts at which a limit begins to act in these flights."""
+    what, below = effect.limit
+    most = max(float({
+        'tilt_rate': lambda m: np.abs(m.signals.joints({})[1]).max(),
+        'torque': lambda m: np.quantile(np.abs(_torques(m)), 0.999),
+        'thrust': lambda m: np.quantile(m.flight.command[:, 4:], 0.999)}[what](m))
+        for m in models)
+    return tuple((float(np.log(part * most / key.base)),) for part, in effect.starts
+                 if part * most < below * key.base)
+
+
+def _torques(model):
+    """
+    Torques [N m] that the simulated servo loops request, without limits and encoder noise.
+
+    They include damping, which takes most of the stiffness term while a servo turns.
+    """
+    s, joint = model.signals, model.robot.joints
+    run = model._servos([{}], {})[0]
+    rate = np.gradient(run, model.p.grid, axis=1)
+    times = s.t[model._starts][:, None] + model.p.grid * np.arange(run.shape[1])
+    edges = np.append(times.ravel(), times[-1, -1] + model.p.grid)
+    target = s.tilt_targets(edges, s.delays({})[0]).reshape(run.shape)
+    return Servo.of(joint, effort_limit=None).motor(NUMPY, target - run, rate)

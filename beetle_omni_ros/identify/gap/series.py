@@ -6,13 +6,11 @@ from functools import cache
 import numpy as np
 from scipy.signal import firwin, upfirdn
 
-from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.robot import rotations
 
 SHARPNESS = 5.0     # number of taps times edge over sampling rate
 THIN = 2            # decimation of the grid for the body equations
 EDGE = 1.0          # [s] at both ends, for smoothing and history
-LEAST_SAMPLES = 20  # of each channel, for the autoregression of its noise
 
 
 @dataclass(frozen=True)
@@ -72,20 +70,6 @@ def low_pass(edge: float, every: int, period: float) -> LowPass:
     count = step * max(1, round(length / step)) + 1
     # The end taps of a Hann window are zero, so derivatives of the taps are complete.
     return LowPass(firwin(count, edge, window='hann', fs=1 / period), every, period)
-
-
-def channel_filters(p: GapParameters) -> dict[str, LowPass]:
-    """Filter of each group of channels."""
-    return {'B': low_pass(p.body_edge, p.body_every, THIN * p.grid),
-            'A': low_pass(p.world_edge, p.world_every, p.grid),
-            'W': low_pass(p.rate_edge, p.rate_every, p.grid),
-            'J': low_pass(p.joint_edge, p.joint_every, p.grid)}
-
-
-def shortest_flight(p: GapParameters) -> float:
-    """Duration [s] below which some channel has fewer than ``LEAST_SAMPLES`` samples."""
-    return 2 * EDGE + max(kernel.period * (len(kernel.taps) + LEAST_SAMPLES * kernel.every)
-                          for kernel in channel_filters(p).values())
 
 
 def turn(vector):

@@ -43,26 +43,3 @@ class Prior:
         """``x``, or the nearest value within so many standard deviations."""
         reach = deviations * self.deviation
         return np.clip(x, self.centre - self.below - reach, self.centre + self.above + reach)
-
-
-def together(priors: dict[str, Prior], values: dict[str, float], names: list[str],
-             free: frozenset[str] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Slopes and residuals of the priors of several parameters.
-
-    Args:
-        priors: priors by name.
-        values: values by name; default 0.
-        names: K names.
-        free: parameters whose priors are ignored.
-
-    Returns:
-        (K,) and (K,); 0 for a parameter that is free or has no prior.
-
-    """
-    result = np.zeros((2, len(names)))
-    for k, name in enumerate(names):
-        if name in priors and name not in free:
-            x = values.get(name, 0.0)
-            result[:, k] = priors[name].slope(x), priors[name].residual(x)
-    return result[0], result[1]

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import norm
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.gap.results import summary
+from beetle_omni_ros.identify.flights.text import summary
 from beetle_omni_ros.identify.inference.hierarchy import WIDTH
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.fit import (
@@ -98,7 +98,7 @@ def compare(log: JointLog, robot: RobotParameters) -> Found:
 
 def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
     """
-    Verdict, effects and errors, with the keys of a gap of flights (`gap/results.py`).
+    Verdict, effects and errors, with the keys of a gap of flights (`flights/results.py`).
 
     Args:
         found: comparison with the robot file.
@@ -139,10 +139,7 @@ def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
                           'excess': float(before[u] / floor[u]),
                           'excess_after': float(after[u] / floor[u])}
                          for u, number in enumerate(numbers)), key=lambda row: -row['excess']),
-        'horizons': {'held-out part': {
-            'before': ratio['before'], 'after': ratio['after'], 'effects_alone': ratio['after'],
-            'placebo': None, 'closure': closure}},
-        'regimes': {}, 'held_out': True, 'findings': []}
+        'held_out': True, 'bad_data': [], 'findings': []}
 
 
 def _evidence(found, name):
@@ -162,8 +159,7 @@ def _evidence(found, name):
 def _candidates(found):
     """One row for each entry with its evidence, largest gain first."""
     return [{'name': name, 'accepted': name in found.chosen.entries,
-             'evidence': _evidence(found, name), 'sigma_of_realistic_size': None,
-             'sigma_beside_rivals': {},
+             'evidence': _evidence(found, name),
              'reason': '' if name in found.chosen.entries else
              'the evidence does not need it' if found.gains[name] < CERTAIN else
              'less than an encoder count, or no better on left-out blocks'}

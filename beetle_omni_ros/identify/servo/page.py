@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import matplotlib
 from matplotlib.figure import Figure
 
-from beetle_omni_ros.identify.gap.page import head
+from beetle_omni_ros.identify.flights.page import head
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.fit import Found
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log

@@ -1,40 +1,28 @@
-"""
-Bags judged by the flight engine, beside :mod:`beetle_omni_ros.identify.gap.command`.
-
-It has no verdict ``unknown`` and no page yet, so that ``beetle_omni gap`` does not use it.
-``benchmarks/gap_campaign.py --workflow new=beetle_omni_ros.identify.flights.bag_command:run_bags``
-compares both on the same flights.
-"""
+"""Verdict about flights that were recorded as bags."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 from math import exp
-from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
 from beetle_omni_ros.identify.flights.bag import BagFlight
-from beetle_omni_ros.identify.flights.command import (
+from beetle_omni_ros.identify.flights.engine import Engine
+from beetle_omni_ros.identify.flights.priors import entries_of, Entry, Spread, spread, VARYING
+from beetle_omni_ros.identify.flights.results import (
+    ALPHA,
     candidates_of,
     CROWD,
     effect_of,
-    gaps_of,
-    headline,
     named_of,
+    numbers_of,
+    reason_of,
     result_of,
-    summary_of,
     where_of,
 )
-from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.priors import entries_of, Entry, Spread, spread, VARYING
-from beetle_omni_ros.identify.gap.analysis import swing_of, tilting_modules
-from beetle_omni_ros.identify.gap.apply import write_corrected
-from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.candidates import limit_starts
-from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
+from beetle_omni_ros.identify.gap.body import BodyModel, swing_of, tilting_modules
 from beetle_omni_ros.identify.gap.keys import (
     all_keys,
     extra_keys,
@@ -44,44 +32,17 @@ from beetle_omni_ros.identify.gap.keys import (
     tolerances,
 )
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.residual import limit_starts
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.files import write_json
 
-ALPHA = 0.05
 LATE = 0.012, 0.024          # [s] latencies at which the tilting modules are decided, too
-NONE = {'force': {'used': True, 'channels': []}}
+COMPARED = {group: {'used': True, 'channels': [c for c in BagFlight.channels
+                                               if c.startswith(group)]}
+            for group in ('force', 'torque', 'acceleration', 'rate', 'joint')}
 # Deviations at which effects without a slope at zero begin; those of limits follow from flights.
 STARTS = {'joint_friction': ((0.003, 0.003), (0.008, 0.008), (0.02, 0.02)),
           'joint_backlash': ((0.005,), (0.02,), (0.05,))}
-
-
-def run_bags(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path | None = None,
-             apply: Path | None = None, json_path: Path | None = None, page: Path | None = None,
-             console: Console | None = None) -> int:
-    """
-    Find differences between model and bags; arguments and status of :func:`run_gap`.
-
-    Raises:
-        BagError, ParameterError: a run or a file is unusable.
-
-    """
-    model, p = RobotParameters.load(robot), GapParameters.load()
-    try:
-        flights, judging = ([load_flight(path, model, p) for path in paths]
-                            for paths in (runs, holdout))
-    except UnusableFlight as error:
-        write_json(json_path, result_of('bad_data', {}, str(error)))
-        return 3
-    result = judged(flights, judging, model, p)
-    result['meta'] = {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
-                      'robot': str(robot) if robot else 'params/robot.yaml'}
-    write_json(json_path, result)
-    if apply and result['effects']:
-        write_corrected(apply, result, model, robot)
-    if console:
-        console.print(headline(result), result['summary'])
-    return 0
 
 
 def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapParameters,
@@ -122,12 +83,12 @@ def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapP
     for model in others:
         model.settle(dict(zip(names, solution.theta, strict=False)))
     return result_of(
-        verdict, NONE, summary_of(verdict, sets, error, solution),
+        verdict, COMPARED, reason_of(verdict, sets, error, solution),
         effects=effects if verdict != 'not_decidable' else [],
         partial=effects if verdict == 'not_decidable' else [],
         candidates=candidates_of(solution, found), where=where_of(engine, solution),
         false_alarm_probability=error, held_out=bool(judging),
-        **gaps_of(engine, solution, [k for k, _ in found], others or models))
+        **numbers_of(engine, solution, [k for k, _ in found], others or models))
 
 
 def _choose_modules(models, every):

@@ -1,0 +1,157 @@
+"""The HTML page of an analysis."""
+
+from __future__ import annotations
+
+from math import log
+
+import matplotlib
+from matplotlib.figure import Figure
+import numpy as np
+
+from beetle_omni_ros.identify.flights.text import evidence, grids, headline, label, whole
+from beetle_omni_ros.identify.gap.bags import Recording
+from beetle_omni_ros.identify.recording.clocks import begin_of
+from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
+from beetle_omni_ros.pages.page import Grid, html, page, section, verdict_head
+
+BEFORE, AFTER = COLOURS[1], COLOURS[0]
+VERDICT_COLOURS = {'no_gap': '#2b7a3d', 'named': '#1f5fa8', 'named_set': '#1f5fa8',
+                   'unknown': '#b06a00', 'not_decidable': '#b06a00', 'bad_data': '#b3261e'}
+APART = 5       # MoCap readings between two orientations of a finite difference
+HEIGHT = 0.24   # [in] of a row of a figure
+
+
+def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str:
+    """One self-contained page; ``damaged``: a recording and the first of its damages."""
+    notes = [f'Next experiment: {result["next_experiment"]}.'] \
+        if result['next_experiment'] else []
+    notes += dict.fromkeys(result['findings'])
+    candidates, sections = result['candidates'], []
+    if candidates:
+        least = log(1 / result['meta']['alpha'])
+        sections = [
+            section('Evidence', 'Every entry of the catalogue that these flights were compared '
+                    'with. An effect is named if its evidence outweighs the number of entries '
+                    f'that were tried and the accepted probability of a false alarm ({least:.1f} '
+                    'nat).', html(evidence(candidates, len(candidates)))),
+            section('Tolerances', 'Deviations of this robot from the robot file, as fitted and '
+                    'not named; --tolerances writes masses, gains, lags and rotor positions to '
+                    'the robot file.', html(_tolerances(result)))]
+    with matplotlib.rc_context(STYLE):
+        picture = svg(_damage(*damaged), 'damaged readings') if damaged else svg(
+            picture_of(result), 'disagreement and sizes') if result['where'] else ''
+    return page('Gap', _about(result['meta']), grids(result, brief=False), notes, sections,
+                head(result, picture))
+
+
+def _about(meta):
+    """Flights and robot file in one line."""
+    parts = {'flights': meta['runs'], 'held out': meta['holdout'],
+             'robot file': [meta['robot']]}
+    return '; '.join(f'{word}: {", ".join(runs)}' for word, runs in parts.items() if runs)
+
+
+def head(result: dict, picture: str = '') -> str:
+    """Head of the page: verdict, sentence and picture, as HTML."""
+    return verdict_head(headline(result), VERDICT_COLOURS[result['verdict']], result['summary'],
+                        picture)
+
+
+def picture_of(result: dict) -> Figure:
+    """Disagreement by channel before and after, and the sizes of the effects with intervals."""
+    sizes = _sizes(result['effects'] or result['partial'])
+    rows = sorted(whole(result), key=lambda row: row['channel'])[::-1]
+    figure, axes = panels(1, 2 if sizes else 1, height=HEIGHT * max(len(rows), len(sizes)) + 0.6)
+    place = np.arange(len(rows))
+    for key, shift, colour, text in (('excess', 0.18, BEFORE, 'robot file'),
+                                     ('excess_after', -0.18, AFTER, 'fit')):
+        axes[0, 0].barh(place + shift, [row[key] for row in rows], 0.36, color=colour, label=text)
+    axes[0, 0].axvline(1.0, color=FAINT, ls='--', lw=0.9, label='noise')
+    axes[0, 0].set_yticks(place, [row['channel'] for row in rows])
+    axes[0, 0].set_xlabel('RMS of measured minus expected, over the noise')
+    legend(figure, axes[0, 0])
+    if sizes:
+        _draw(axes[0, 1], sizes[::-1])
+    return figure
+
+
+def _draw(axis, sizes):
+    for k, (_, middle, low, high) in enumerate(sizes):
+        axis.plot([low, high], [k, k], color=INK, lw=1.4)
+        axis.plot(middle, k, 'o', color=AFTER, ms=4)
+    axis.axvline(0.0, color=BEFORE, lw=0.9)
+    axis.set_yticks(np.arange(len(sizes)), [text for text, *_ in sizes])
+    axis.set_xlabel('value minus robot file, in typical sizes; 95 %')
+
+
+def _sizes(effects):
+    """Name, deviation and its interval of each number, over its typical deviation."""
+    result = []
+    for effect in effects:
+        for name, found in effect['parameters'].items():
+            values, file = np.atleast_1d(found['value']), np.atleast_1d(found['file'])
+            spans = np.reshape(found['interval'], (-1, 2))
+            for k, (value, own, span) in enumerate(zip(values, file, spans, strict=True)):
+                more = f' {"xyz"[k]}' if len(values) == 3 else ''
+                result.append((f'{label({**effect, "names": effect["names"][:1]})}\n{name}{more}',
+                               *((x - own) / found['typical'] for x in (value, *span))))
+    return result
+
+
+def _tolerances(result):
+    rows = [[name, f'{100 * e["deviation"]:.2f} %' if e['relative'] else f'{e["deviation"]:.2g}']
+            for name, e in result['tolerances'].items()]
+    return Grid('', ['number', 'deviation'], rows)
+
+
+def _damage(recording, damage):
+    """Figure of the damaged, uncorrected readings; a dashed line marks the onset."""
+    begin = begin_of(recording)
+    joints = damage['topic'] in ('joint_states', 'command')
+    figure, axes = panels(4 if joints else 3, 1, height=1.1, sharex=True)
+    draw = _joints if joints else _motion
+    draw(recording, axes[:, 0], begin)
+    for axis in axes[:, 0]:
+        if damage['at_s'] is not None:
+            axis.axvline(damage['at_s'], color=COLOURS[1], ls='--', lw=1.0)
+    axes[-1, 0].set_xlabel('stamp [s], from the first IMU message on')
+    legend(figure, axes[0, 0])
+    return figure
+
+
+def _joints(recording, axes, begin):
+    for k, axis in enumerate(axes):
+        for topic, colour in (('command', FAINT), ('joint_states', COLOURS[0])):
+            values = recording.values[topic]
+            if len(values):
+                axis.plot(recording.times[topic] - begin, values[:, k], color=colour, lw=0.9,
+                     label=topic)
+        axis.set_ylabel(f'gimbal{k + 1} [rad]')
+
+
+def _motion(recording, axes, begin):
+    rate, force, place = axes
+    t, values = recording.times['imu/data_raw'] - begin, recording.values['imu/data_raw']
+    if len(t):
+        rate.plot(t, np.linalg.norm(values[:, 3:], axis=1), color=COLOURS[0], lw=0.8,
+             label='imu/data_raw')
+        force.plot(t, np.linalg.norm(values[:, :3], axis=1), color=COLOURS[0], lw=0.8)
+    t, pose = recording.times['mocap/pose'] - begin, recording.values['mocap/pose']
+    if len(t) > APART:
+        rate.plot(*_turning(t, pose[:, 3:]), color=COLOURS[1], lw=0.8, label='mocap/pose')
+        for k, axis in enumerate('xyz'):
+            place.plot(t, pose[:, k], lw=0.8, color=COLOURS[k], label=axis)
+        place.legend(loc='upper right', ncols=3)
+    rate.set_ylabel('rate [rad/s]')
+    force.set_ylabel('force [m/s^2]')
+    place.set_ylabel('position [m]')
+
+
+def _turning(t, quaternion):
+    """Times (n,) and magnitude of the rate (n,) [rad/s] of orientations (N, 4)."""
+    with np.errstate(all='ignore'):
+        unit = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+        cosine = np.clip(np.abs((unit[APART:] * unit[:-APART]).sum(axis=1)), 0, 1)
+        steps = t[APART:] - t[:-APART]
+        rate = 2 * np.arccos(cosine) / np.where(steps > 0, steps, np.nan)
+    return 0.5 * (t[APART:] + t[:-APART]), rate

@@ -1,0 +1,288 @@
+"""Results of an analysis of flights, as they are written as JSON."""
+
+from __future__ import annotations
+
+from collections import Counter
+from math import log
+
+import numpy as np
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.identify.flights.engine import Engine, log_prior, Solution
+from beetle_omni_ros.identify.flights.evidence import Judge, Posterior
+from beetle_omni_ros.identify.flights.priors import Entry
+from beetle_omni_ros.identify.flights.text import summary
+from beetle_omni_ros.identify.gap.keys import Key
+from beetle_omni_ros.identify.gap.residual import UNITS
+from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
+
+ALPHA = 0.05            # probability of a false alarm that is accepted
+CROWD = 4               # members of a set from which the flights do not decide
+LEAST_TIME = 1.0        # [s] in a regime, of which an RMS is stated
+Starts = dict[str, dict[str, float]]
+
+
+def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
+    """
+    Results with all fixed keys.
+
+    Flights that do not show most of the catalogue decide nothing.
+
+    Args:
+        verdict: a key of :data:`~beetle_omni_ros.identify.flights.text.WORDS`.
+        groups: each group of channels: ``used``, ``channels``, and ``reason`` if not.
+        reason: why no effect is named, as the end of a sentence.
+        more: further keys, and those that have another value than that of bad data.
+
+    """
+    result: dict = {
+        'verdict': verdict, 'reason': reason, 'effects': [], 'partial': [], 'where': [],
+        'closure': None, 'gap_before': None, 'gap_after': None, 'noise_floor': None,
+        'candidates': [], 'hidden': [], 'tolerances': {}, 'false_alarm_probability': None,
+        'held_out': False, 'groups': groups, 'bad_data': [], 'findings': [],
+        'next_experiment': None, 'meta': {'version': __version__}} | more
+    seen = {row['name'] for row in result['candidates']} - set(result['hidden'])
+    if verdict == 'no_gap' and len(result['hidden']) > len(seen):
+        result |= {'verdict': (verdict := 'not_decidable'), 'reason': (
+            'most known effects would not have been detected at their typical size')}
+    unclear = [effect['names'] for effect in [*result['effects'], *result['partial']]
+               if len(effect['names']) > 1]
+    if unclear:
+        result['next_experiment'] = separating_experiment(unclear[0])
+    elif verdict == 'not_decidable' and result['hidden']:
+        result['next_experiment'] = Counter(
+            CATALOGUE[name].excited_by for name in result['hidden']).most_common(1)[0][0]
+    return result | {'summary': summary(result)}
+
+
+def named_of(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int, list[int]]]:
+    """
+    Entries of the best set that the flights need, with those that could stand in their place.
+
+    An entry is needed if the set without it is less probable by ``alpha``. Its rivals are the
+    entries whose set in its place is more probable than ``alpha`` of the best one.
+    """
+    if solution.e_value < log(1 / alpha):
+        return []
+    best, gain = solution.best, engine.gain
+    named = []
+    for k in best:
+        if solution.entries[k].varying:
+            continue
+        rest = set(best) - {k}
+        needed = gain(solution.judge, best, tuple(sorted(rest)))
+        if needed < log(1 / alpha):
+            continue
+        rivals = [(gain(solution.judge, tuple(sorted(rest | {j})), best), j)
+                  for j in range(len(solution.entries))
+                  if j not in best and j not in solution.banned
+                  and (solution.entries[j].name != solution.entries[k].name
+                       or not solution.entries[j].varying)]
+        members = [k, *(j for less, j in sorted(rivals, reverse=True) if less > log(alpha))]
+        named.append((-needed, k, members))
+    return [(k, members) for _, k, members in sorted(named)]
+
+
+def effect_of(solution: Solution, engine: Engine, keys: dict[str, Key], k: int,
+              members: list[int], starts: Starts | None = None) -> dict:
+    """Names, sizes and evidence of a named entry; ``starts`` as of :class:`BagFlight`."""
+    entry, rest = solution.entries[k], set(solution.best) - {k}
+    gain = engine.gain(solution.judge, solution.best, tuple(sorted(rest)))
+
+    def sizes(j):
+        index = sorted(engine.indices(tuple(rest | {j})))
+        return parameters(solution.entries[j], engine, index, solution.judge.posterior(index),
+                          keys, starts or {})
+
+    result: dict = {
+        'names': list(dict.fromkeys(solution.entries[j].name for j in members)),
+        'parameters': sizes(k), 'layer': CATALOGUE[entry.name].layer, **_member(entry),
+        'evidence': {'ln_bayes_factor': gain, 'delta_bic': 2 * gain,
+                     'constancy': -solution.unsteady.get(k, 0.0)}}
+    if rivals := [{'name': solution.entries[j].name, **_member(solution.entries[j]),
+                   'parameters': sizes(j)} for j in members[1:]]:
+        result['rivals'] = rivals
+    return result
+
+
+def _member(entry):
+    return {CATALOGUE[entry.name].each: entry.member} if entry.member is not None else {}
+
+
+def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Posterior,
+               keys: dict[str, Key], starts: Starts) -> dict:
+    """
+    Parameter -> value, unit, 95 % interval, value of the robot file and typical deviation.
+
+    Args:
+        entry: the entry.
+        engine: for the index of each key.
+        index: keys of the set that ``posterior`` is about.
+        posterior: estimate of a set that has the entry.
+        keys: keys by name.
+        starts: name of a start -> deviations of the keys of its effect.
+
+    """
+    found = {}
+    # key -> factors of the set's keys that make its deviation
+    rows: dict[str, np.ndarray] = {}
+    for name in entry.keys:
+        start, _, tangent = name.partition('~')
+        for key, part in starts.get(start, {name: 1.0}).items():
+            if not tangent or tangent == key:
+                row = rows.setdefault(key, np.zeros(len(index)))
+                row[index.index(engine.index[name])] += part
+    for parameter, spec in CATALOGUE[entry.name].parameters.items():
+        own = [name for name in rows if keys[name].parameter == parameter]
+        values, spans = [], []
+        for name in own:
+            key, row = keys[name], rows[name]
+            middle = float(row @ posterior.estimate)
+            half = 1.96 * float(row @ posterior.covariance @ row)**0.5
+            values.append(key.value(middle))
+            spans.append([max(key.value(middle - half), min(spec.low, values[-1])),
+                          min(key.value(middle + half), max(spec.high, values[-1]))])
+        if own:
+            base, key = [keys[name].base for name in own], keys[own[0]]
+            one, row = len(own) == 1, np.abs(rows[own[0]])
+            typical = float((row * engine.typical[index]).max())
+            found[parameter] = {'value': values[0] if one else values, 'unit': spec.unit,
+                                'interval': spans[0] if one else spans,
+                                'file': base[0] if one else base,
+                                'typical': typical * (key.base if key.relative else 1.0)}
+    return found
+
+
+def expected(judge: Judge, index: list[int]) -> float:
+    """
+    Mean ln of the evidence that a set of keys would have, if they had their typical size [nat].
+
+    With the covariance C of the estimate, and the variances N of the narrow and S of the wide
+    prior, the estimate would scatter by C + S about the robot file, so that the mean of its log
+    density ratio is the divergence of both normal densities.
+    """
+    c, _, wide, _, _ = judge._profile(tuple(sorted(index)))
+    free = np.isin(c, index)
+    null = wide + np.diag(judge.narrow[c]**2)
+    ratio = np.linalg.solve(null, null + np.diag(free * judge.typical[c]**2))
+    return float(0.5 * (np.trace(ratio) - len(c) - np.linalg.slogdet(ratio)[1])
+                 - log(3) * judge.far[c[free]].any())
+
+
+def candidates_of(solution: Solution, named: list[tuple[int, list[int]]]) -> list[dict]:
+    """
+    Evidence of each entry alone, the largest first.
+
+    Of the starts of one entry, the one with most evidence counts. ``expected_ln_bayes_factor`` is
+    the evidence that a typical size would have in these flights.
+    """
+    taken = {k for k, _ in named}
+    rows: dict[tuple, dict] = {}
+    for k, entry in enumerate(solution.entries):
+        if entry.varying:
+            continue
+        gain = solution.gains.get((k,))
+        index = [solution.names.index(key) for key in entry.keys]
+        row = {'name': entry.name, **_member(entry), 'accepted': k in taken,
+               'reason': 'value differs between frequencies' if k in solution.banned else '',
+               'evidence': {'ln_bayes_factor': gain,
+                            'delta_bic': None if gain is None else 2 * gain},
+               'expected_ln_bayes_factor': expected(solution.judge, index)}
+        other = rows.get((entry.name, entry.member))
+        if other is None or _rank(row) > _rank(other):
+            rows[entry.name, entry.member] = row
+    return sorted(rows.values(), key=_rank, reverse=True)
+
+
+def _rank(row):
+    gain = row['evidence']['ln_bayes_factor']
+    return row['accepted'], -np.inf if gain is None else gain
+
+
+def hidden_of(solution: Solution, alpha: float) -> list[str]:
+    """Entries that would not be named at their typical size: their mean evidence is too small."""
+    count = len(solution.entries)
+    best: dict[str, float] = {}
+    least = log(1 / alpha) + log_prior(0, count) - log_prior(1, count)
+    for row in candidates_of(solution, []):
+        name = row['name']
+        best[name] = max(best.get(name, -np.inf), row['expected_ln_bayes_factor'])
+    return [name for name, evidence in best.items() if evidence < least]
+
+
+def where_of(engine: Engine, solution: Solution) -> list[dict]:
+    """
+    Disagreement of the robot file by channel and regime of the flight, largest first.
+
+    ``excess``: RMS of the whitened residual over the noise; of a regime, in proportion to the
+    RMS there. Rows of the regime 'flight' are about all samples, with ``excess_after`` of the fit
+    without discrepancy, and ``rms``, ``rms_after`` and ``discrepancy_rms`` of what repeats and is
+    in no entry, with a unit.
+    """
+    known, count, whitened, raw = engine.known, len(engine.names), [], []
+    for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
+        x = solution.equations.of_flight(k, solution.theta)[:count]
+        x[:known] += solution.theta[:known]
+        x[known:] = 0.0
+        noise = np.sqrt(np.diagonal(found.noise, axis1=1, axis2=2))[found.band]
+        whitened.append([(r / noise).reshape(-1, len(engine.channels))
+                         for r in (found.residual, found.residual + found.slopes @ x)])
+        raw.append([np.where(flight.mask, flight.linear(at, []).residual, np.nan)
+                    for at in ({}, dict(zip(engine.names[:known], x[:known], strict=True)))])
+    excess, rms = (np.sqrt([np.nanmean(np.concatenate(parts)**2, axis=0)
+                            for parts in zip(*own, strict=True)]) for own in (whitened, raw))
+    rows: list[dict] = [
+        {'channel': name, 'regime': 'flight', 'excess': float(excess[0, c]),
+         'excess_after': float(excess[1, c]), 'rms': float(rms[0, c]),
+         'rms_after': float(rms[1, c]), 'discrepancy_rms': discrepancy,
+         'unit': UNITS[name.partition('_')[0]]}
+        for c, (name, _, discrepancy) in enumerate(engine.disagreement(solution))]
+    before = np.concatenate([parts[0] for parts in raw])
+    regime = np.concatenate([regimes_of(flight.motion) for flight in engine.flights])
+    for c, name in enumerate(engine.channels):
+        for text in np.unique(regime):
+            there = before[regime == text, c]
+            there = there[np.isfinite(there)]
+            if len(there) * engine.flights[0].period >= LEAST_TIME:
+                rows.append({'channel': name, 'regime': str(text), 'excess': float(
+                    excess[0, c] * np.sqrt(np.mean(there**2)) / rms[0, c])})
+    return sorted(rows, key=lambda row: -row['excess'])
+
+
+def regimes_of(motion: dict[str, np.ndarray]) -> np.ndarray:
+    """(N,) regime of each sample: rotate, near ground, translate, tilted or hover."""
+    regime = np.full(len(motion['velocity']), 'hover', dtype=object)
+    regime[np.abs(motion['tilt']).max(axis=1) > 1.0] = 'tilted'
+    regime[np.linalg.norm(motion['velocity'], axis=1) > 0.4] = 'translate'
+    regime[motion['position'][:, 2] < 0.6] = 'near ground'
+    regime[np.linalg.norm(motion['rate'], axis=1) > 0.8] = 'rotate'
+    return regime
+
+
+def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: list) -> dict:
+    """
+    Errors over the noise floor without and with the named effects, closure, and what was fitted.
+
+    ``tolerances`` are the deviations of keys that are not named; ``hidden``: see
+    :func:`hidden_of`.
+    """
+    before, after, floor, closure = engine.errors(solution, named, flights)
+    keys, own = engine.flights[0].keys, set(engine.indices(named))
+    return {'gap_before': before / floor, 'gap_after': after / floor, 'noise_floor': 1.0,
+            'closure': closure, 'hidden': hidden_of(solution, engine.alpha),
+            'tolerances': {name: {'deviation': float(solution.theta[k]),
+                                  'relative': keys[name].relative}
+                           for k, name in enumerate(engine.names[:engine.known])
+                           if name in keys and k not in own}}
+
+
+def reason_of(verdict: str, sets: list[list[Entry]], error: float, solution: Solution) -> str:
+    """Why a verdict without names was reached, as the end of a sentence."""
+    if verdict != 'not_decidable':
+        return ''
+    if sets:
+        return 'they do not separate ' + ' and '.join(
+            ' or '.join(dict.fromkeys(e.name.replace('_', ' ') for e in members))
+            for members in sets)
+    return (f'an effect is more likely than none, but a false alarm would have the probability '
+            f'{error:.2g}')
