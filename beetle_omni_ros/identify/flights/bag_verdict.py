@@ -4,24 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import exp
 
 import numpy as np
 
 from beetle_omni_ros.identify.flights.bag import BagFlight
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.priors import entries_of, Entry, Spread, spread, VARYING
-from beetle_omni_ros.identify.flights.results import (
-    ALPHA,
-    candidates_of,
-    CROWD,
-    effect_of,
-    named_of,
-    numbers_of,
-    reason_of,
-    result_of,
-    where_of,
-)
+from beetle_omni_ros.identify.flights.results import ALPHA, concluded
 from beetle_omni_ros.identify.gap.body import BodyModel, swing_of, tilting_modules
 from beetle_omni_ros.identify.gap.keys import (
     all_keys,
@@ -61,8 +50,8 @@ def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapP
     coarse = float(np.median([m.signals.position_noise for m in models])) > p.coarse_noise
     names, spreads, entries = _priors(robot, keys, p, starts, coarse)
     kept = _limits(robot, p, coarse)
-    bounds = {n: (0.0, np.inf) for n in (*starts, *(
-        n for n in names if n in keys and keys[n].ends_at_none))} | kept
+    bounds = {n: (0.0, np.inf) for n in names
+              if n in starts or n in keys and keys[n].ends_at_none} | kept
     far = frozenset(n for n in names if n in keys and keys[n].effect in CATALOGUE
                     and keys[n].effect not in ('mass', 'inertia')
                     and CATALOGUE[keys[n].effect].layer not in ('sensor', 'timing'))
@@ -73,22 +62,10 @@ def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapP
                     kept=frozenset(kept),
                     curved=frozenset({*starts, *tangents}))
     solution = engine.run()
-    found = named_of(engine, solution, alpha)
-    sets = [[solution.entries[j] for j in members] for _, members in found]
-    error = exp(min(0.0, -solution.e_value))
-    crowd = max((len({e.name for e in members}) for members in sets), default=0)
-    verdict = 'not_decidable' if crowd >= CROWD else 'named_set' if crowd > 1 else \
-        'named' if sets else 'no_gap' if solution.e_value < 0 else 'not_decidable'
-    effects = [effect_of(solution, engine, keys, k, members, starts) for k, members in found]
     for model in others:
         model.settle(dict(zip(names, solution.theta, strict=False)))
-    return result_of(
-        verdict, COMPARED, reason_of(verdict, sets, error, solution),
-        effects=effects if verdict != 'not_decidable' else [],
-        partial=effects if verdict == 'not_decidable' else [],
-        candidates=candidates_of(solution, found), where=where_of(engine, solution),
-        false_alarm_probability=error, held_out=bool(judging),
-        **numbers_of(engine, solution, [k for k, _ in found], others or models))
+    return concluded(engine, solution, keys, others or models, COMPARED, starts=starts,
+                     held_out=bool(judging))
 
 
 def _choose_modules(models, every):
@@ -118,11 +95,11 @@ def _starts(keys, models):
 
 def _limits(robot, p, coarse):
     """Limits of tolerances, beyond which a deviation is a finding."""
-    imu, encoders = p.coarse_latency if coarse else (p.imu_averaging, None)
-    bus = -p.command_delay, p.command_delay_range / 2
-    limits = {TILT_BUS: bus, THRUST_BUS: bus, 'imu_filter_lag.delay': (0.0, imu),
+    bus = -p.command_delay, p.bus_late
+    limits = {TILT_BUS: bus, THRUST_BUS: bus,
+              'imu_filter_lag.delay': (0.0, p.coarse_imu if coarse else p.imu_averaging),
               'swing.ratio': (-p.tolerance_swing, swing_of(robot) + p.tolerance_swing)}
-    return limits | ({'joint_feedback_delay.delay': (0.0, encoders)} if coarse else {})
+    return limits | ({'joint_feedback_delay.delay': (0.0, p.coarse_encoders)} if coarse else {})
 
 
 def _priors(robot, keys, p, starts, coarse):
@@ -130,9 +107,10 @@ def _priors(robot, keys, p, starts, coarse):
     fitted = {n: key for n, key in keys.items() if not key.form and key.effect not in LIMITS
               and (n != 'modules.share' or robot.multibody is not None)}
     tolerance = {n: float(np.max(prior.deviation)) for n, prior in tolerances(p).items()}
-    imu, encoders = p.coarse_latency if coarse else (p.imu_averaging, p.tolerance_delay)
-    tolerance |= {TILT_BUS: p.bus_near[int(coarse)], THRUST_BUS: p.bus_near[int(coarse)],
-                  'imu_filter_lag.delay': imu, 'joint_feedback_delay.delay': encoders,
+    tolerance |= {TILT_BUS: p.bus_near, THRUST_BUS: p.bus_near,
+                  'imu_filter_lag.delay': p.coarse_imu if coarse else p.imu_averaging,
+                  'joint_feedback_delay.delay':
+                      p.coarse_encoders if coarse else p.tolerance_delay,
                   'swing.ratio': p.tolerance_swing + swing_of(robot)}
     spreads = {n: spread(robot, key, tolerance.get(n, 0.0), 0.0)
                if key.effect in CATALOGUE else Spread(tolerance[n], key.typical, 0.0)

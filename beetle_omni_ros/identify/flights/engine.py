@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import combinations
-from math import comb, log
 
 import numpy as np
 
 from beetle_omni_ros.identify.flights.discrepancy import discrepancies
-from beetle_omni_ros.identify.flights.evidence import Judge, Normal, normal, Posterior
+from beetle_omni_ros.identify.flights.evidence import Judge, normal
 from beetle_omni_ros.identify.flights.priors import Entry, Spread
+from beetle_omni_ros.identify.flights.solution import log_prior, Solution
 from beetle_omni_ros.identify.flights.spectrum import (
     EDGES,
     pooled,
-    Spectrum,
     spectrum,
     whitening,
 )
@@ -30,53 +29,6 @@ PAIRED = 20             # entries whose pairs are all weighed; others follow fro
 FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
 RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
 GROUPS = (0.0, 0.5, 2.0)    # [Hz] lower ends of the groups of bands of the test of constancy
-
-
-@dataclass(eq=False)
-class Solution:
-    """
-    Result of the engine.
-
-    Attributes:
-        names: keys.
-        entries: catalogue entries.
-        gains: set of indices of entries -> ln of its evidence over that of the empty set.
-        best: most probable set.
-        posterior: its evidence and estimate.
-        unsteady: named entry -> gain of one value for each group of bands over one value [nat].
-        banned: entry that was excluded for this -> its gain.
-        by_band: key of an excluded entry and its further value in each band (bands,).
-
-    """
-
-    names: list[str]
-    entries: list[Entry]
-    gains: dict[tuple[int, ...], float]
-    best: tuple[int, ...]
-    posterior: Posterior
-    equations: Normal
-    judge: Judge
-    spectra: list[Spectrum] = field(default_factory=list)
-    unsteady: dict[int, float] = field(default_factory=dict)
-    banned: dict[int, float] = field(default_factory=dict)
-    by_band: list[tuple[int, np.ndarray]] = field(default_factory=list)
-
-    @property
-    def theta(self) -> np.ndarray:
-        """(K,) mean of the keys with the best set."""
-        return self.posterior.theta
-
-    @property
-    def e_value(self) -> float:
-        """Ln of the evidence of any set over the empty one, averaged over their prior."""
-        total = [log_prior(len(c), len(self.entries)) + gain
-                 for c, gain in self.gains.items() if c]
-        return float(np.logaddexp.reduce(total) - log(0.5))
-
-
-def log_prior(size: int, count: int) -> float:
-    """Ln of the prior of one set of ``size`` of ``count`` entries; one more is half as likely."""
-    return -(size + 1) * log(2.0) - log(comb(count, size))
 
 
 class Engine:
@@ -113,7 +65,7 @@ class Engine:
         self.kept = np.array([name in kept for name in names])
         self.index = {name: k for k, name in enumerate(names)}
         self._generic()
-        self.filters = [None] * len(self.flights)
+        self.filters: list = [None] * len(self.flights)     # (C, L) of each flight
         self._last: dict = {}       # flight -> point and linear model
         kinds = [c.split('_')[0] for c in self.channels]
         kinds = ['body' if kind in ('force', 'torque') else kind for kind in kinds]
@@ -135,7 +87,7 @@ class Engine:
         """
         # (flight, index of the key, index of its value in this flight)
         self.repeats: list[tuple[int, int, int]] = []
-        more = {}
+        more: dict[str, Spread] = {}
         if len(self.flights) < 2:
             return more
         for entry in [e for e in self.entries if set(e.keys) <= set(varying)]:
@@ -343,6 +295,7 @@ class Engine:
             best = chosen
             visited.add(best)
         weight(best)
+        weight(tuple(k for k in best if self.entries[k].varying))
         posterior = judge.posterior(self.indices(best))
         bands = self._bands_of_groups()
         own = posterior.theta[self.known:].reshape(copies, len(keys))
@@ -355,27 +308,6 @@ class Engine:
         total = len(self.entries)
         return judge.gain(self.indices(one), self.indices(other)) \
             + log_prior(len(one), total) - log_prior(len(other), total)
-
-    def explained(self, solution: Solution, group: str) -> float:
-        """Share of the variance of a group's measurements that the fit predicts, by motion."""
-        left = total = 0.0
-        for k, (flight, found) in enumerate(zip(self.flights, solution.spectra, strict=True)):
-            own = [c for c, name in enumerate(flight.channels) if name.startswith(group)]
-            # without the generic discrepancy, which predicts what feedback leaves
-            x = solution.equations.of_flight(k, solution.theta)[:len(self.names)]
-            x[:self.known] += solution.theta[:self.known]
-            # a fit of feedback makes the robot heavier; the inertia is that of the file
-            x[[k for k, name in enumerate(self.names) if name.startswith('inertia.')]] = 0.0
-            moving = found.band > 0
-            moving[found.counts[0]:] = False
-            left += (((found.residual + found.slopes @ x) / np.sqrt(np.diagonal(
-                found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
-            measured = spectrum(flight.linear({}, []).measured, np.zeros((*flight.mask.shape, 0)),
-                                flight.mask, flight.period, found.floor, flight.highest,
-                                self.groups, self.filters[k])
-            total += ((measured.residual / np.sqrt(np.diagonal(
-                found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
-        return 1 - left / total
 
     def _filter(self, spectrum, noise):
         power = np.diagonal(noise, axis1=1, axis2=2)[:spectrum.band[-1] + 1]
@@ -420,69 +352,6 @@ class Engine:
                                 np.tile(form, copies), np.tile(size, copies))
             own = self.known + (np.arange(copies)[:, None] * len(keys) + np.arange(count)).ravel()
             solution.unsteady[k] = judge.posterior(own).gain
-
-    def disagreement(self, solution: Solution) -> list[tuple[str, float, float]]:
-        """Channel, RMS of the file's residual over the noise, RMS of the discrepancy."""
-        weights = solution.equations.of_generic(solution.theta)
-        raw = [flight.linear({}, []).residual for flight in self.flights]
-        rows = []
-        for c, name in enumerate(self.channels):
-            here = [flight.mask[:, c] for flight in self.flights]
-            found = np.concatenate([g[m, c].reshape(m.sum(), len(weights)) @ weights
-                                    for g, m in zip(self.generic, here, strict=True)])
-            size = np.sqrt(np.mean(np.concatenate([r[m, c] for r, m in zip(
-                raw, here, strict=True)])**2))
-            noise = np.sqrt(np.mean([power[c] for power in self.power]))
-            rows.append((name, float(size / noise), float(found.std())))
-        return rows
-
-    def errors(self, solution: Solution, named: Sequence[int], flights: Sequence
-               ) -> tuple[float, float, float, float | None]:
-        """
-        Whitened RMS of flights without and with the named entries, and of a fit; closure.
-
-        Tolerances of the robot are as fitted, so that they count neither before nor after. The
-        last fit adapts everything to these flights, within the priors.
-        The flights' own deviations are fitted within their priors in each case. The noise is that
-        of the fitted flights.
-        """
-        keep = self.flights, self.generic, self.filters
-        self.flights, self.filters = list(flights), [self.common] * len(flights)
-        self.generic = discrepancies(self.flights)
-        zeros = np.zeros((len(flights), len(self.names)))
-        theta = np.concatenate([solution.theta[:self.known],
-                                np.zeros(len(self.names) - self.known)])
-        fitted = self.flights == keep[0]
-        spectra = self._spectra(theta, zeros, fitted)
-        self.flights, self.generic, self.filters = keep
-        noise, total, count = pooled(solution.spectra), np.zeros(3), 0
-        less = theta.copy()
-        less[self.indices(named)] = 0.0
-        own = self.flight.copy()
-        varied = set() if fitted else set(self.indices(solution.best))
-        for _, key, column in self.repeats:
-            if column in varied:
-                own[key] = self.typical[column]
-        every = np.hypot(self.narrow, own)
-        every[self.indices(named)] += 9 * self.typical[self.indices(named)]
-        for each in spectra:
-            each.noise = noise
-            g, h = (part.sum(axis=(0, 1)) for part in each.grams())
-            r2 = each.power()
-            for k, (start, free) in enumerate((
-                    (less, own), (theta, own), (theta, every))):
-                at = np.flatnonzero(free > 0)
-                left = h - g @ start
-                move = np.linalg.solve(g[at][:, at] + np.diag(free[at]**-2), left[at])
-                value = r2 - 2 * h @ start + start @ g @ start
-                total[k] += value - 2 * left[at] @ move + move @ g[at][:, at] @ move
-            count += each.size
-        total = np.maximum(total, 1e-9 * count)
-        # chi2 that is left of the difference, if the flights show a difference at all
-        closure = 1 - max(total[1] - total[2], 0.0) / (total[0] - total[2]) \
-            if total[0] - total[1] > 2 * log(1 / self.alpha) else None
-        before, after, floor = np.sqrt(total / count)
-        return float(before), float(after), float(floor), closure
 
     def _judge(self, equations, wide=None, named=(), form=(), size=()):
         """Judge of all known keys, and of deviations of bands with priors ``form``, ``size``."""

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from collections import Counter
-from math import log
+from collections.abc import Sequence
+from math import exp, log
 
 import numpy as np
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.flights.engine import Engine, log_prior, Solution
+from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import Judge, Posterior
 from beetle_omni_ros.identify.flights.priors import Entry
+from beetle_omni_ros.identify.flights.quality import disagreement, errors
+from beetle_omni_ros.identify.flights.solution import log_prior, Solution
 from beetle_omni_ros.identify.flights.text import summary
+from beetle_omni_ros.identify.flights.unexplained import Unexplained, unexplained
 from beetle_omni_ros.identify.gap.keys import Key
 from beetle_omni_ros.identify.gap.residual import UNITS
 from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 
 ALPHA = 0.05            # probability of a false alarm that is accepted
 CROWD = 4               # members of a set from which the flights do not decide
+NAMING = 'named', 'named_set'
+SHARE = 0.2             # of the accepted probability for both tests of what is unexplained
 LEAST_TIME = 1.0        # [s] in a regime, of which an RMS is stated
 Starts = dict[str, dict[str, float]]
 
@@ -53,6 +59,38 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
         result['next_experiment'] = Counter(
             CATALOGUE[name].excited_by for name in result['hidden']).most_common(1)[0][0]
     return result | {'summary': summary(result)}
+
+
+def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: list,
+              groups: dict, held_out: bool, starts: Starts | None = None,
+              findings: Sequence[str] = ()) -> dict:
+    """
+    Results of a solution.
+
+    Args:
+        engine: with the fitted flights.
+        solution: of the engine.
+        keys: keys by name.
+        judges: flights that the errors are about.
+        groups: as of :func:`result_of`.
+        held_out: whether the judges are other flights than the fitted ones.
+        starts: as of :class:`~beetle_omni_ros.identify.flights.bag.BagFlight`.
+        findings: sentences about the flights.
+
+    """
+    found = named_of(engine, solution, engine.alpha)
+    sets = [[solution.entries[j] for j in members] for _, members in found]
+    rest = unexplained(engine, solution)
+    verdict = verdict_of(solution, sets, rest, engine.alpha)
+    effects = [effect_of(solution, engine, keys, k, members, starts) for k, members in found]
+    return result_of(
+        verdict, groups, reason_of(verdict, sets, rest, solution),
+        effects=effects if verdict in NAMING else [],
+        partial=[] if verdict in NAMING else effects,
+        candidates=candidates_of(solution, found), where=where_of(engine, solution),
+        false_alarm_probability=chance_of(solution), held_out=held_out,
+        findings=[*findings, *varied(engine, solution)],
+        **numbers_of(engine, solution, [k for k, _ in found], judges))
 
 
 def named_of(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int, list[int]]]:
@@ -128,9 +166,9 @@ def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Poster
     rows: dict[str, np.ndarray] = {}
     for name in entry.keys:
         start, _, tangent = name.partition('~')
-        for key, part in starts.get(start, {name: 1.0}).items():
-            if not tangent or tangent == key:
-                row = rows.setdefault(key, np.zeros(len(index)))
+        for of, part in starts.get(start, {name: 1.0}).items():
+            if not tangent or tangent == of:
+                row = rows.setdefault(of, np.zeros(len(index)))
                 row[index.index(engine.index[name])] += part
     for parameter, spec in CATALOGUE[entry.name].parameters.items():
         own = [name for name in rows if keys[name].parameter == parameter]
@@ -236,7 +274,7 @@ def where_of(engine: Engine, solution: Solution) -> list[dict]:
          'excess_after': float(excess[1, c]), 'rms': float(rms[0, c]),
          'rms_after': float(rms[1, c]), 'discrepancy_rms': discrepancy,
          'unit': UNITS[name.partition('_')[0]]}
-        for c, (name, _, discrepancy) in enumerate(engine.disagreement(solution))]
+        for c, (name, _, discrepancy) in enumerate(disagreement(engine, solution))]
     before = np.concatenate([parts[0] for parts in raw])
     regime = np.concatenate([regimes_of(flight.motion) for flight in engine.flights])
     for c, name in enumerate(engine.channels):
@@ -266,7 +304,7 @@ def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: li
     ``tolerances`` are the deviations of keys that are not named; ``hidden``: see
     :func:`hidden_of`.
     """
-    before, after, floor, closure = engine.errors(solution, named, flights)
+    before, after, floor, closure = errors(engine, solution, named, flights)
     keys, own = engine.flights[0].keys, set(engine.indices(named))
     return {'gap_before': before / floor, 'gap_after': after / floor, 'noise_floor': 1.0,
             'closure': closure, 'hidden': hidden_of(solution, engine.alpha),
@@ -276,13 +314,57 @@ def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: li
                            if name in keys and k not in own}}
 
 
-def reason_of(verdict: str, sets: list[list[Entry]], error: float, solution: Solution) -> str:
+def chance_of(solution: Solution) -> float:
+    """Probability that a set of effects has as much evidence without any effect."""
+    return exp(min(0.0, -solution.e_value))
+
+
+def verdict_of(solution: Solution, sets: list[list[Entry]], rest: list[Unexplained],
+               alpha: float) -> str:
+    """
+    Verdict on flights.
+
+    Args:
+        solution: of the engine.
+        sets: named entries, each with those that could stand in its place.
+        rest: tests of what no entry explains, the most improbable first.
+        alpha: accepted probability of a false alarm.
+
+    """
+    if rest and rest[0].probability < alpha * SHARE and rest[0].gain > solution.gains.get(
+            solution.best, 0.0):
+        return 'unknown'
+    if sets:
+        crowd = max(len({entry.name for entry in members}) for members in sets)
+        return 'not_decidable' if crowd >= CROWD else 'named_set' if crowd > 1 else 'named'
+    return 'no_gap' if solution.e_value < log(1 / alpha) else 'not_decidable'
+
+
+def varied(engine: Engine, solution: Solution) -> list[str]:
+    """A sentence for each thing that differs from flight to flight."""
+    found = []
+    for k in solution.best:
+        entry = solution.entries[k]
+        if entry.varying:
+            values = np.array([solution.theta[engine.index[key]] for key in entry.keys])
+            values = np.linalg.norm(values.reshape(len(engine.flights), -1), axis=1) \
+                if len(values) > len(engine.flights) else values
+            unit = next(iter(CATALOGUE[entry.name].parameters.values())).unit
+            found.append(f"{entry.name.replace('_', ' ')} differs from flight to flight: "
+                         + ', '.join(f'{value:.2g}' for value in values) + f' {unit}')
+    return found
+
+
+def reason_of(verdict: str, sets: list[list[Entry]], rest: list[Unexplained],
+              solution: Solution) -> str:
     """Why a verdict without names was reached, as the end of a sentence."""
+    if verdict == 'unknown':
+        return rest[0].sentence
     if verdict != 'not_decidable':
         return ''
     if sets:
         return 'they do not separate ' + ' and '.join(
             ' or '.join(dict.fromkeys(e.name.replace('_', ' ') for e in members))
             for members in sets)
-    return (f'an effect is more likely than none, but a false alarm would have the probability '
-            f'{error:.2g}')
+    return ('an effect is more likely than none, but a false alarm would have the probability '
+            f'{chance_of(solution):.2g}')

@@ -3,25 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import exp
 from pathlib import Path
 
 import numpy as np
 
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.priors import entries_of, keys_of, spread
+from beetle_omni_ros.identify.flights.quality import explained
 from beetle_omni_ros.identify.flights.residual import COMPARED, GROUPS, TableFlight
-from beetle_omni_ros.identify.flights.results import (
-    ALPHA,
-    candidates_of,
-    CROWD,
-    effect_of,
-    named_of,
-    numbers_of,
-    reason_of,
-    result_of,
-    where_of,
-)
+from beetle_omni_ros.identify.flights.results import ALPHA, concluded, result_of
 from beetle_omni_ros.identify.flights.table import Format, read_flight
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, tolerances
@@ -117,32 +107,16 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
         for flight in [*flights, *judging] if flight.apart]
     engine, keys = _engine(usable, robot, p, declared, alpha, progress)
     solution = engine.run()
-    if groups['torque']['used'] and engine.explained(solution, 'torque') < EXPLAINED:
+    if groups['torque']['used'] and explained(engine, solution, 'torque') < EXPLAINED:
         for flight in [*usable, *judging]:
             flight.without(('torque',), FEEDBACK)
         groups = _groups(usable[0], declared)
         engine, keys = _engine(usable, robot, p, declared, alpha, progress)
         solution = engine.run()
     progress('judging')
-    named = named_of(engine, solution, alpha)
-    sets = [[solution.entries[j] for j in members] for _, members in named]
-    error = exp(min(0.0, -solution.e_value))
-    verdict = 'not_decidable'
-    null = 1 / (1 + exp(min(solution.e_value, 700.0)))     # both halves of the prior
-    if named:
-        largest = max(map(len, sets))
-        verdict = 'named' if largest == 1 else 'named_set' if largest < CROWD else 'not_decidable'
-    elif null >= 1 - alpha:
-        verdict = 'no_gap'
-    effects = [effect_of(solution, engine, keys, k, members) for k, members in named]
     judges = [flight for flight in judging if flight.usable] or usable
-    return result_of(
-        verdict, groups, reason_of(verdict, sets, error, solution),
-        effects=effects if verdict != 'not_decidable' else [],
-        partial=effects if verdict == 'not_decidable' else [],
-        candidates=candidates_of(solution, named), where=where_of(engine, solution),
-        false_alarm_probability=error, held_out=bool(judging), findings=findings,
-        **numbers_of(engine, solution, [k for k, _ in named], judges))
+    return concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
+                     findings=findings)
 
 
 def _groups(flight, declared):

@@ -16,9 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import f as f_law, t as student
+from scipy.stats import f as f_law
+from scipy.stats import t as student
 
 from beetle_omni_ros.identify.flights.discrepancy import acting, LEAN
+from beetle_omni_ros.identify.flights.engine import Engine
+from beetle_omni_ros.identify.flights.quality import left_of
+from beetle_omni_ros.identify.flights.solution import Solution
 from beetle_omni_ros.identify.flights.spectrum import blocks_of, Spectrum, spectrum
 
 WAVES = 12                                  # random features
@@ -48,6 +52,14 @@ class Unexplained:
     channels: tuple[str, ...]
     frequency: float | None = None
 
+    @property
+    def sentence(self) -> str:
+        """What was found, as the end of a sentence."""
+        where = f"in {' and '.join(name.replace('_', ' ') for name in self.channels)}"
+        what = f'a vibration of {self.frequency:.2g} Hz' if self.frequency else \
+            'something that depends on the motion and repeats'
+        return f'no known effect explains {what} {where} (probability {self.probability:.1g})'
+
 
 def features(motion: dict[str, np.ndarray], time: np.ndarray) -> np.ndarray:
     """(N, P) state of the robot in units of order one, and random waves of it."""
@@ -62,8 +74,8 @@ def features(motion: dict[str, np.ndarray], time: np.ndarray) -> np.ndarray:
     return np.concatenate([plain, waves], axis=1)
 
 
-def repeatable(flights, spectra: list[Spectrum], left: list[np.ndarray], filters,
-               channels: tuple[str, ...]) -> Unexplained:
+def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
+               filters: list[np.ndarray], channels: tuple[str, ...]) -> Unexplained:
     """
     Test of a discrepancy that predicts blocks which it was not fitted to.
 
@@ -84,23 +96,21 @@ def repeatable(flights, spectra: list[Spectrum], left: list[np.ndarray], filters
         effect = acting(flight.robot, flight.motion, x - mean, channels)
         effect = effect.reshape(len(x), len(channels), -1)[:, own]
         small = spectrum(np.zeros(effect.shape[:2]), effect, flight.mask[:, own], flight.period,
-                         found.floor[own], np.broadcast_to(flight.highest, len(channels))[own], [np.arange(len(own))],
-                         kernels[own])
+                         found.floor[own], np.broadcast_to(flight.highest, len(channels))[own],
+                         [np.arange(len(own))], kernels[own])
         count = found.counts[0]
         root = np.linalg.inv(np.linalg.cholesky(found.noise[-1][np.ix_(own, own)]))
         a = (root @ small.slopes[:, :count]).reshape(len(rest), -1, effect.shape[2])
         b = (rest[:, :count][..., own] @ root.T).reshape(len(rest), -1)
         info.append(a.transpose(0, 2, 1) @ a)
         score.append((a.transpose(0, 2, 1) @ b[..., None])[..., 0])
-    info, score = np.concatenate(info), np.concatenate(score)
-    whole, right = info.sum(axis=0), score.sum(axis=0)
+    blocks = list(zip(np.concatenate(info), np.concatenate(score), strict=True))
+    whole, right = (sum(part) for part in zip(*blocks, strict=True))
     unit = np.eye(len(right))
 
     def gains_with(size):
-        moved = (np.linalg.solve(whole - g + unit / size**2, right - h) for g, h in zip(
-            info, score, strict=True))
-        return np.array([h @ w - w @ g @ w / 2 for g, h, w in zip(
-            info, score, moved, strict=True)])
+        moved = [np.linalg.solve(whole - g + unit / size**2, right - h) for g, h in blocks]
+        return np.array([h @ w - w @ g @ w / 2 for (g, h), w in zip(blocks, moved, strict=True)])
 
     gains = max((gains_with(size) for size in SIZES), key=lambda own: own.sum())
     count, scatter = len(gains), np.std(gains, ddof=1) if len(gains) > 1 else np.inf
@@ -109,7 +119,7 @@ def repeatable(flights, spectra: list[Spectrum], left: list[np.ndarray], filters
                        float(np.sum(gains)), tuple(channels[c] for c in own))
 
 
-def line(flights, spectra: list[Spectrum], left: list[np.ndarray],
+def line(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
          channels: tuple[str, ...]) -> Unexplained:
     """
     Test of a periodic force or torque.
@@ -140,21 +150,7 @@ def line(flights, spectra: list[Spectrum], left: list[np.ndarray],
         float(frequency))
 
 
-def left_of(engine, solution) -> list[np.ndarray]:
-    """(B, F, C) whitened residual of each flight after the fit, without the discrepancy."""
-    rows = []
-    for k, found in enumerate(solution.spectra):
-        x = solution.equations.of_flight(k, solution.theta)[:len(engine.names)]
-        x[:engine.known] += solution.theta[:engine.known]
-        x[engine.known:] = 0.0
-        rest = found.residual + found.slopes @ x
-        for key, values in solution.by_band:
-            rest += found.slopes[:, :, :, key] * values[found.band][None, :, None]
-        rows.append(rest)
-    return rows
-
-
-def unexplained(engine, solution) -> list[Unexplained]:
+def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
     """Both tests; the most improbable first."""
     left = left_of(engine, solution)
     rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),

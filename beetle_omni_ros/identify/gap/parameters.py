@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter
@@ -60,13 +58,15 @@ class GapParameters:
         doc='Prior deviation of mountings and joint zeros.', unit='rad', low=0, high=1)
     tolerance_delay: float = _time('Prior deviation of delays of sensors.', 1e-6, 0.1)
     imu_averaging: float = _time('Latency of an IMU by averaging.', 0, 0.1)
+    coarse_imu: float = _time('Possible latency of an IMU beside a noisy MoCap.', 1e-6, 1)
+    coarse_encoders: float = _time('Possible latency of encoders beside it.', 1e-6, 1)
     tolerance_swing: float = parameter(
         doc='Log ratio by which the apparent inertia of a servo may differ.', unit='1', low=0,
         high=10)
     modules_tolerance: float = _share('Prior deviation of the terms of the tilting modules.')
     command_delay: float = _time('Nominal delay from a stamp to the actuator.', 0, 0.1)
-    bus_near: np.ndarray = parameter(
-        doc='Prior deviation of that delay, of each bus.', unit='s', shape=(1,), low=1e-6, high=1)
+    bus_near: float = _time('Prior deviation of that delay, of each bus.', 1e-6, 1)
+    bus_late: float = _time('Most by which a bus is late without a finding.', 1e-6, 1)
     contact_height: float = parameter(
         doc='Height of base_link below which feet may touch.', unit='m', low=0, high=10)
     limit_margin: float = _share('Share of the largest thrust up to which samples count.')
