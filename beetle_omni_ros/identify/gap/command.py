@@ -19,7 +19,6 @@ from beetle_omni_ros.identify.gap.bags import read_recording
 from beetle_omni_ros.identify.gap.ingest import (
     check_apart,
     check_flights,
-    Flight,
     load_flight,
     UnusableFlight,
 )
@@ -113,29 +112,25 @@ def _tables(runs, holdout, robot, p, form, alpha, progress):
 
 def _bags(runs, holdout, robot, p, fix, alpha, progress):
     given = [*runs, *holdout]
-    flights, damages = [], []
+    flights, errors = [], []
     for path, name in zip(given, names_of(given), strict=True):
         try:
             flights.append(load_flight(path, robot, p, fix, name))
         except UnusableFlight as error:
-            damages.append((error, error.problems))
-    if damages:
+            errors.append(error)
+    if errors:
         # A verdict from the other flights would be read as one from all of them.
-        return result_of('bad_data', {}, str(damages[0][0]), bad_data=[
+        return result_of('bad_data', {}, str(errors[0]), bad_data=[
             {'run': d.run, 'topic': d.topic, 'cause': d.cause, 'at_s': d.at_s, 'sure': d.sure,
-             'fix': d.fix} for _, problems in damages for d in problems])
+             'fix': d.fix} for error in errors for d in error.problems])
     check_flights(given, flights, p.same_flight)
     fitted, judging = flights[:len(runs)], flights[len(runs):]
     if not judging and len(fitted) > LEAST_FITTED:
         fitted, judging = fitted[:-1], fitted[-1:]
     progress('weighing effects')
     result = judged(fitted, judging, robot, p, alpha)
-    result['findings'] += _findings(flights)
+    result['findings'] += [text for flight in flights for text in flight.findings]
     return result
-
-
-def _findings(flights: list[Flight]) -> list[str]:
-    return [text for flight in flights for text in flight.findings]
 
 
 def _damaged(result, given):

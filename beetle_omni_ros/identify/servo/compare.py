@@ -78,11 +78,15 @@ def is_joint_log(path: Path) -> bool:
     """Whether a run is a table, or a bag in which joints and commands were recorded alone."""
     if path.suffix.lower() == '.csv':
         return True
+    recorded: set[str] = set()
     try:
-        recorded = {Path(raw.topic).name for raw in read_messages(path)}
+        for raw in read_messages(path):
+            recorded.add(Path(raw.topic).name)
+            if recorded & {'pose', 'data_raw', 'odom'}:     # the rest of a flight is not read
+                return False
     except (BagError, OSError):
         return False
-    return recorded >= {'joint_states', 'command'} and not recorded & {'pose', 'data_raw', 'odom'}
+    return recorded >= {'joint_states', 'command'}
 
 
 def compare(log: JointLog, robot: RobotParameters) -> Found:
