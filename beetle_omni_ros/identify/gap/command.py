@@ -21,7 +21,7 @@ from beetle_omni_ros.identify.gap.results import grids, headline, results
 from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.robot_file import check_differs
 from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_log
-from beetle_omni_ros.identify.servo.page import change_grids, gap_log_page
+from beetle_omni_ros.identify.servo.page import gap_log_page
 from beetle_omni_ros.pages.page import print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag import names_of, runs_in
@@ -64,8 +64,7 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
     if any(is_joint_log(run) for run in runs):
         with console.status('comparing the servos'):
             result, apart = analyse_joint_logs(runs, holdout, robot_parameters, robot)
-        html = gap_log_page(apart, result, [*grids(result), *change_grids(result['changes'])],
-                            robot_parameters) if page else ''
+        html = gap_log_page(apart, result, grids(result), robot_parameters) if page else ''
     else:
         meta = {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                 'robot': str(robot) if robot else 'params/robot.yaml'}
@@ -126,6 +125,6 @@ def _print(console, result):
     console.print(result['summary'], highlight=False, markup=False)
     for finding in dict.fromkeys(result['findings']):
         console.print(finding, style='dim', highlight=False, markup=False)
-    print_grids([*grids(result), *change_grids(result.get('changes', []))], console)
+    print_grids(grids(result), console)
     if result['next_experiment']:
         console.print(f"Next: {result['next_experiment']}", highlight=False, markup=False)
