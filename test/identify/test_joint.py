@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from servo_logs import COUNT, log_of, sweep, trapezoid
 
-from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.joint import identify, interval, joint_results, left_out_rms
 from beetle_omni_ros.identify.servo.model import INDEX
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -103,7 +102,7 @@ def test_ramps_and_holds_show_no_error_of_the_encoder(seed, lines):
 
 def test_samples_of_the_validation_part_are_not_used_by_the_fit():
     log = log_of(*sweep(3.0, periods=(0.8, 1.0)), SERVOS[:1], seed=4)
-    measured, end = log.measured.copy(), log.end_of(shipped().servo.fitted)
+    measured, end = log.measured.copy(), log.end
     measured[:, end:] += COUNT * np.round(50 * np.sin(40 * log.t[end:]))
     one, other = (identify([each], ROBOT) for each in (log, replace(log, measured=measured)))
     assert one.chosen.entries == other.chosen.entries

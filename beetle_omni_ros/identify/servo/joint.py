@@ -30,16 +30,14 @@ ALWAYS = 'joint_bandwidth', 'joint_command_latency', 'joint_friction', 'joint_of
 DELAYS = np.arange(0.0, 0.12, 5e-4)     # [s] of a line
 
 
-def identify(logs: Sequence[JointLog], robot: RobotParameters,
-             fitted: float | None = None, one_delay: bool = False) -> Found:
+def identify(logs: Sequence[JointLog], robot: RobotParameters, one_delay: bool = False) -> Found:
     """
     Identify the servos from the first part of some logs.
 
     The model with the largest evidence predicts best. The robot file as the simulator flies it is
     the centre of the prior.
     """
-    servos = Servos(logs, file_sets(robot, flown=True), fitted, one_delay)
-    return select(servos, ALWAYS, list(ENTRIES))
+    return select(Servos(logs, file_sets(robot, flown=True), one_delay), ALWAYS, list(ENTRIES))
 
 
 def interval(found: Found, trial: Trial, unit: int, name: str) -> tuple[float, float]:
@@ -47,10 +45,8 @@ def interval(found: Found, trial: Trial, unit: int, name: str) -> tuple[float, f
     p = INDEX[name]
     log = found.servos.logs[found.servos.units[unit][0]]
     if not mask(trial.entries)[p]:
-        reached = {'velocity_limit': log.speed().max(),
-                   'torque_limit': np.abs(log.command - log.measured).max()}
-        value = float(found.values(trial)[unit, p])
-        return (float(reached[name]), np.inf) if name in reached else (value, value)
+        value, reached = float(found.values(trial)[unit, p]), log.reached()
+        return (reached[name], np.inf) if name in reached else (value, value)
     width = WIDTH * np.sqrt(trial.fit.spread()[unit, p, p])
     ends = trial.fit.theta[unit, p] + width * np.array([-1, 1])
     low, high = np.exp(ends) if LOGARITHMIC[p] else ends
@@ -85,7 +81,7 @@ def left_out_rms(found: Found, unit: int) -> tuple[float, float]:
     block, rows = s.blocks[unit], s.rows[k]
     mine = np.array(s.labels['log']) == k
     read, slopes = s.readings(k, fit.theta[mine], mask(found.chosen.entries))
-    moved = slopes[:, joint].T @ fit.s[unit] @ fit.deviations.T
+    moved = slopes[:, joint].T @ fit.s[unit] @ fit.deviations[s.folds].T
     servo = read[joint] - s.logs[k].measured[joint, rows] + moved[np.arange(len(rows)), block]
     line = [Line(s.logs[k], joint, rows[block != b]).errors(s.logs[k], joint, rows[block == b])
             for b in np.unique(block)]
@@ -111,8 +107,7 @@ def joint_results(found: Found, validations: Sequence[JointLog], robot: RobotPar
 def _joint(found, unit, validations, robot):
     log, (_, index, number) = found.servos.logs[0], found.servos.units[unit]
     file, is_held = file_sets(robot)[number - 1], held(robot)
-    values, end = found.values()[unit], log.end_of(shipped().servo.fitted)
-    first, last = slice(0, end), slice(end, None)
+    values, first, last = found.values()[unit], slice(0, log.end), slice(log.end, None)
     known = [(other, other.joints.index(number) if number in other.joints else None)
              for other in validations]
     line, apart = Line(log, index, found.servos.rows[0]), left_out_rms(found, unit)
@@ -131,7 +126,7 @@ def _joint(found, unit, validations, robot):
         'left_out_rms_rad': dict(zip(('servo', 'line'), apart, strict=True)),
         'line': {'gain': float(line.slope - 1), 'offset_rad': float(line.offset),
                  'delay_s': float(line.delay), 'heldout_rms_rad': of_line(log, index, last)},
-        'holds_for': log.first(shipped().servo.fitted).motion(index),
+        'holds_for': log.first().motion(index),
         'published_rms_rad': error_rms(log, index, file, is_held),
         'fit_rms_rad': predicted(log, index, first),
         'heldout_rms_rad': predicted(log, index, last),

@@ -20,8 +20,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 MILLI = 1e3
 
 
-def grids(results: dict, brief: bool = False) -> list[Grid]:
-    """Errors and terms, a column for each joint; ``brief``: only terms of some joint's model."""
+def grids(results: dict) -> list[Grid]:
+    """Errors, range of motion and terms of the model, a column for each joint."""
     joints = results['joints']
     header = ['', *(f'joint {joint["joint"]}' for joint in joints)]
     rows = [[text, *(_milli(joint[key]) for joint in joints)] for text, key in (
@@ -40,15 +40,10 @@ def grids(results: dict, brief: bool = False) -> list[Grid]:
         [text, *('{:.3g}..{:.3g}'.format(*joint['holds_for'][key]) for joint in joints)]
         for text, key in (('angle [rad]', 'angle_rad'), ('rate [rad/s]', 'rate_rad_s'),
                           ('acceleration [rad/s^2]', 'acceleration_rad_s2'))])
-    names = [name for name in joints[0]['terms'] if not brief
-             or any(joint['terms'][name]['kept'] for joint in joints)]
+    names = [name for name, term in joints[0]['terms'].items() if term['kept']]
     rows = [[f'{name} [{_unit(joints[0]["terms"][name]["unit"])}]',
              *(_value(joint['terms'][name]) for joint in joints)] for name in names]
-    unused = frozenset(k for k, name in enumerate(names)
-                       if not any(joint['terms'][name]['kept'] for joint in joints))
-    return [errors, motion, Grid(
-        'Terms with 95 % interval; in brackets: not in the model, did not improve the prediction '
-        'of other motion', header, rows, unused)]
+    return [errors, motion, Grid('Terms with 95 % interval', header, rows)]
 
 
 def _milli(value):
@@ -64,8 +59,7 @@ def _value(term):
     numbers = [None if v is None else factor * v for v in (term['value'], *term['interval'])]
     value, low, high = ('inf' if v is None else f'{v:.{digits}g}' if abs(v) < 99.5 else f'{v:.0f}'
                         for v, digits in zip(numbers, (3, 2, 2), strict=True))
-    text = f'{value},\n{low}..{high}'      # two lines: four joints fit into 80 columns
-    return text if term['kept'] else f'[{text}]'
+    return f'{value},\n{low}..{high}'      # two lines: four joints fit into 80 columns
 
 
 def joint_page(found: Found, validations: Sequence[JointLog], robot: RobotParameters,
