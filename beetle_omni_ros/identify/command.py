@@ -50,7 +50,7 @@ def run_identify_joint(paths: Sequence[Path], *, validate: Sequence[Path] = (),
     results = joint_results(found, validations, robot_parameters)
     if robot:
         results['meta']['robot'] = str(robot)
-    _print(console, of_joints.grids(results, brief=True), results['text'])
+    _print(console, of_joints.grids(results), results['text'])
     write_json(json_path, results)
     if report:
         write_text(report, of_joints.joint_page(found, validations, robot_parameters, results),
@@ -125,7 +125,7 @@ def run_identify_robot(paths: Sequence[Path], params: Path, *, rate: float | Non
             found = identify(joints, robot_parameters, one_delay=True)
             servo = servo_values(found, robot_parameters)
         results['servos'] = joint_results(found, [], robot_parameters)
-        print_grids(of_joints.grids(results['servos'], brief=True), console)
+        print_grids(of_joints.grids(results['servos']), console)
     if rotors:
         model = of_rotor.identify_rotor(rotors)
         results['rotor'] = of_rotor.rotor_results(model)

@@ -36,8 +36,6 @@ class ServoFitParameters:
                                 high=10)
     first_noise: float = parameter(doc='White noise of the first fit.', unit='rad', low=1e-6,
                                    high=1)
-    memory: float = parameter(doc='Time over which errors are correlated.', unit='s', low=0.01,
-                              high=10)
     between: float = parameter(doc='Relative difference of the gains between logs, for intervals.',
                                unit='1', low=0.001, high=1)
     beyond: float = parameter(doc='Least ratio of a command and a limit that it identifies.',
@@ -49,12 +47,9 @@ class ServoFitParameters:
                               unit='1', low=0, high=1)
     loose: float = parameter(doc='Least half width in scales of a member of such a pair.',
                              unit='1', low=0, high=100)
-    sines: np.ndarray = parameter(doc='Frequencies of proposed sines.', unit='Hz',
-                                  shape=(8,), low=0.01, high=100)
-    sine_time: float = parameter(doc='Length of a sine.', unit='s', low=2, high=600)
-    sine_amplitude: float = parameter(doc='Largest amplitude of a sine.', unit='rad', low=0.01,
-                                      high=3)
-    sine_speed: float = parameter(doc='Largest speed of a sine.', unit='rad/s', low=0.1, high=100)
+    sine_time: float = parameter(doc='Length of a proposed sine.', unit='s', low=2, high=600)
+    sine_amplitude: float = parameter(doc='Amplitude of it.', unit='rad', low=0.01, high=3)
+    sine_speed: float = parameter(doc='Speed of it.', unit='rad/s', low=0.1, high=100)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

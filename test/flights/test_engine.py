@@ -85,8 +85,8 @@ def test_evidence_of_one_key_agrees_with_quadrature(positive):
 def test_evidence_of_a_typical_size_is_the_mean_over_its_estimates():
     rng = np.random.default_rng(4)
     found = normal([linear_flight(rng, np.zeros(1), keys=1)], ['a'], np.zeros(1))
-    judge = Judge(found, np.array([0.001]), np.array([0.003]), np.array([False]),
-                  np.zeros(1, dtype=int), 0.05, np.array([False]))
+    judge = Judge(found, np.array([0.001]), np.array([0.003]), np.array([[-np.inf, np.inf]]),
+                  np.array([False]), np.zeros(1, dtype=int), 0.05, np.array([False]))
     slab = np.hypot(0.001, 0.003)
     sigma = (judge.posterior((0,)).deviation[0]**-2 - slab**-2)**-0.5
     wide, null = np.hypot(sigma, slab), np.hypot(sigma, 0.001)

@@ -41,7 +41,7 @@ def test_joint_writes_all_its_files(logs, tmp_path, capsys):
             assert set(term) == {'value', 'unit', 'interval', 'kept'}
             assert len(term['interval']) == 2
     assert joints[1]['validation_rms_rad'][1] is None       # the other log has only joint 1
-    assert page.read_text().count('<img') == 6
+    assert page.read_text().count('<img') == 3
     written = RobotParameters.load(params).joints
     assert written.natural_frequency == pytest.approx(
         np.median([joint['terms']['natural_frequency']['value'] for joint in joints]), rel=0.05)

@@ -23,7 +23,7 @@ from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 ALPHA = 0.05            # probability of a false alarm that is accepted
 CROWD = 4               # members of a set from which the flights do not decide
 NAMING = 'named', 'named_set'
-SHARE = 0.2             # of the accepted probability for both tests of what is unexplained
+TESTS = 2               # of what is unexplained; they share the accepted probability
 LEAST_TIME = 1.0        # [s] in a regime, of which an RMS is stated
 Starts = dict[str, dict[str, float]]
 
@@ -331,7 +331,7 @@ def verdict_of(solution: Solution, sets: list[list[Entry]], rest: list[Unexplain
         alpha: accepted probability of a false alarm.
 
     """
-    if rest and rest[0].probability < alpha * SHARE and rest[0].gain > solution.gains.get(
+    if rest and rest[0].probability < alpha / TESTS and rest[0].gain > solution.gains.get(
             solution.best, 0.0):
         return 'unknown'
     if sets:

@@ -27,6 +27,7 @@ from beetle_omni_ros.identify.flights.spectrum import blocks_of, Spectrum, spect
 
 WAVES = 12                                  # random features
 SIZES = (0.001, 0.003, 0.01, 0.03, 0.1)     # amplitudes relative to hover thrust and weight
+SLOWEST = 1.0                               # [Hz] of a line; slower ones are the flight's own path
 NEAR = 12                                   # frequencies on each side that a line is compared with
 TURN, SWING = 1.0, 2.0                      # [rad/s] scales of rates of the body and of tilts
 
@@ -133,7 +134,9 @@ def line(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
     """
     own = spectra[0].groups[0]
     count = min(rest.shape[1] for rest in left)
-    rest = np.concatenate([rest[:, 1:count][..., own] for rest in left])**2
+    length = blocks_of(flights[0].mask, flights[0].period).shape[1] * flights[0].period
+    first = int(np.ceil(2 * length * SLOWEST))
+    rest = np.concatenate([rest[:, first:count][..., own] for rest in left])**2
     blocks, power = len(rest), rest.mean(axis=0)
     ratio = np.ones_like(power)
     for k in range(len(power)):
@@ -143,15 +146,21 @@ def line(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
     sides = 2 * (NEAR - 1)
     chance = float(f_law.sf(ratio[k, c], blocks, blocks * sides)) * ratio.size
     order = np.argsort(-ratio[k])
-    length = blocks_of(flights[0].mask, flights[0].period).shape[1]
-    frequency = (k + 1) / (2 * length * flights[0].period)
+    frequency = (k + first) / (2 * length)
     return Unexplained('line', min(chance, 1.0), float(blocks * (
         ratio[k, c] - 1 - np.log(ratio[k, c])) / 2), tuple(channels[own[i]] for i in order[:2]),
         float(frequency))
 
 
 def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
-    """Both tests; the most improbable first."""
+    """
+    Both tests; the most improbable first.
+
+    Where an entry is excluded, the controller feeds noise back, and what repeats may be its
+    answer; nothing is tested then.
+    """
+    if solution.banned:
+        return []
     left = left_of(engine, solution)
     rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
             line(engine.flights, solution.spectra, left, engine.channels)]

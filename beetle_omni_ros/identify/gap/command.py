@@ -25,7 +25,7 @@ from beetle_omni_ros.identify.gap.ingest import (
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.robot_file import check_differs
 from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_log
-from beetle_omni_ros.identify.servo.page import change_grids, gap_log_page
+from beetle_omni_ros.identify.servo.page import gap_log_page
 from beetle_omni_ros.pages.page import print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -83,8 +83,7 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
     if form is None and any(is_joint_log(run) for run in runs):
         with console.status('comparing the servos'):
             result, apart = analyse_joint_logs(runs, holdout, model, robot)
-        html = gap_log_page(apart, result, [*grids(result), *change_grids(result['changes'])],
-                            model) if page else ''
+        html = gap_log_page(apart, result, grids(result), model) if page else ''
     else:
         # On small matrices, several threads only take more CPU time.
         with console.status('reading') as status, threadpool_limits(1):
@@ -146,7 +145,7 @@ def _print(console, result, apply):
     console.print(result['summary'], highlight=False, markup=False)
     for finding in dict.fromkeys(result['findings']):
         console.print(finding, style='dim', highlight=False, markup=False)
-    print_grids([*grids(result), *change_grids(result.get('changes', []))], console)
+    print_grids(grids(result), console)
     if result['next_experiment']:
         console.print(f"Next: {result['next_experiment']}", highlight=False, markup=False)
     if apply:

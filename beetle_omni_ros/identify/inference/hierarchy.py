@@ -1,23 +1,27 @@
 """
-Fits of common values and of deviations of each group, with evidence and held-out blocks.
+Fits of common values and of deviations of each group, with evidence and left-out blocks.
 
 A *unit* is one measured channel of one recording. Its parameters are ``theta = base + S x``: the
 columns of ``S`` are the prior standard deviations of a common value and of the deviations of the
-groups to which the unit belongs. So the prior of ``x`` is standard normal. The evidence is
-Laplace's approximation (MacKay 2003, chapter 28): a parameter that the data do not need lowers it.
+groups to which the unit belongs. So the prior of ``x`` is standard normal, between the bounds of
+theta. The evidence is Laplace's approximation (MacKay 2003, chapter 28): a parameter that the data
+do not need lowers it. Prior and evidence are normalised over the half spaces of the bounds.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t
 
+from beetle_omni_ros.identify.inference.least_squares import (
+    bounded_step,
+    levenberg_marquardt,
+    log_integral,
+)
 from beetle_omni_ros.identify.inference.robust import huber
 
-CONVERGED = 1e-4    # decrease of the cost, relative to the number of samples
 WIDTH = 1.96        # standard deviations of a 95 % interval
-SLOWEST = 4         # cosines of slow noise
+STRETCHES = 8       # of time, whose scores scatter
 
 
 @dataclass(frozen=True)
@@ -40,10 +44,11 @@ def design(spreads: Sequence[Spread], labels: dict[str, Sequence], active: np.nd
     """
     The matrices S (U, P, X) of all units.
 
+    Deviations of the same units are one column: of a single group, also the common value.
+
     Args:
         spreads: P parameters.
-        labels: name of a grouping -> the group of each of the U units. A grouping with one group
-            has no deviations, unless the parameter has no common value.
+        labels: name of a grouping -> the group of each of the U units.
         active: (P,) parameters that may change.
 
     """
@@ -51,16 +56,16 @@ def design(spreads: Sequence[Spread], labels: dict[str, Sequence], active: np.nd
     columns = []
     for p in np.flatnonzero(active):
         spread = spreads[int(p)]
-        parts = [(spread.common, np.ones(count))] if spread.common else []
+        variance = {(True,) * count: spread.common**2}
         for name, deviation in spread.groups.items():
-            groups = sorted(set(labels[name]))
-            if deviation and (len(groups) > 1 or not spread.common):
-                parts += [(deviation, np.array([label == group for label in labels[name]]))
-                          for group in groups]
-        for scale, member in parts:
-            column = np.zeros((count, len(spreads)))
-            column[:, p] = scale * member
-            columns.append(column)
+            for group in sorted(set(labels[name])):
+                member = tuple(label == group for label in labels[name])
+                variance[member] = variance.get(member, 0.0) + deviation**2
+        for member, size in variance.items():
+            if size:
+                column = np.zeros((count, len(spreads)))
+                column[:, p] = np.sqrt(size) * np.array(member)
+                columns.append(column)
     return np.stack(columns, axis=-1) if columns else np.zeros((count, len(spreads), 0))
 
 
@@ -75,11 +80,13 @@ class Fit:
         theta: (U, P) parameters of each unit.
         chi2: sum of squared whitened residuals, with Huber's loss.
         information: (X, X) of data and prior.
-        held: (blocks,) chi2 of each block, predicted from the others.
-        deviations: (blocks, X) change of x without each block.
-        inflation: variance of the gradient over that of independent residuals, >= 1.
-        slow: (recordings, SLOWEST, X) slowest changes of the gradient over each recording.
-        converged: whether the last step changed the cost by less than CONVERGED a sample.
+        evidence: logarithm [nat], without the constants of the noise.
+        held: (folds,) logarithms of the density of each fold, predicted from the others [nat],
+            without the constants of the noise.
+        deviations: (folds, X) change of x without each fold.
+        inflation: variance of the scores of blocks, or of stretches of time, over that of
+            independent residuals, at least 1.
+        converged: whether the minimum is nearer than 0.01 nat.
 
     """
 
@@ -88,45 +95,15 @@ class Fit:
     theta: np.ndarray
     chi2: float
     information: np.ndarray
+    evidence: float
     held: np.ndarray
     deviations: np.ndarray
     inflation: float
-    slow: np.ndarray
-    converged: bool = False
-
-    def evidence(self, inflation: float) -> float:
-        """Logarithm of the evidence [nat], without constants, for an inflated noise."""
-        size = len(self.x)
-        inner = (self.information - np.eye(size)) / inflation + np.eye(size)
-        return float(-0.5 * (self.chi2 / inflation + self.x @ self.x)
-                     - 0.5 * np.linalg.slogdet(inner)[1])
+    converged: bool
 
     def covariance(self) -> np.ndarray:
-        """
-        (X, X) covariance of x, from curvature and from the slowest change of the residuals.
-
-        The curvature holds for noise inflated by :attr:`inflation`, which is that of short
-        memory. Noise that drifts over the whole recording moves some parameters further, as a
-        zero. So each parameter is widened by the mean over the units that have it of its variance
-        by :attr:`slow`, with the quantile of Student's t for as many terms (Lazarus et al. 2018).
-        """
-        size = len(self.x)
-        curvature = np.linalg.inv((self.information - np.eye(size)) / self.inflation
-                                  + np.eye(size))
-        inverse = np.linalg.inv(self.information)
-        widen = np.ones(size)
-        for p in range(self.s.shape[1]):
-            own = self.s[self.s[:, p].any(axis=1), p]
-            if not len(own):
-                continue
-            # cosines of each recording: at least SLOWEST in all units
-            count = -(-SLOWEST // len(own))
-            waves = own @ inverse @ self.slow[:, :count].reshape(-1, size).T
-            slow = (waves**2).sum(axis=1) / count + ((own @ inverse)**2).sum(axis=1)
-            ratio = (slow / np.einsum('ux,xy,uy->u', own, curvature, own)).mean()
-            ratio *= (t.isf(0.025, len(own) * count) / WIDTH)**2
-            widen[own.any(axis=0)] = np.sqrt(max(ratio, 1.0))
-        return curvature * widen[:, None] * widen
+        """(X, X) covariance of x."""
+        return np.linalg.inv(self.information)
 
     def spread(self) -> np.ndarray:
         """(U, P, P) covariance of theta of each unit."""
@@ -136,11 +113,11 @@ class Fit:
 Model = Callable[[np.ndarray, np.ndarray], tuple[list[np.ndarray], list[np.ndarray]]]
 
 
-def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: Sequence,
-          blocks: list[np.ndarray], low: np.ndarray, high: np.ndarray, memory: dict | int = 20,
-          iterations: int = 15) -> Fit:
+def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray,
+          blocks: Sequence[np.ndarray], low: np.ndarray, high: np.ndarray,
+          folds: np.ndarray | None = None) -> Fit:
     """
-    Levenberg-Marquardt in the standardised values.
+    Fit the standardised values.
 
     Args:
         model: (theta (U, P), active (P,)) -> whitened residuals of each unit (n_u,), and their
@@ -148,99 +125,75 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
         base: (U, P) values at x = 0.
         s: (U, P, X) design.
         x: (X,) start.
-        groups: recording of each unit; units of one recording with equally many samples have them
-            together.
         blocks: (n_u,) number of the block of each sample, from 0, for each unit.
-        low: (P,) lower bounds of theta; a value beyond is clipped.
+        low: (P,) lower bounds of theta.
         high: (P,) upper bounds.
-        memory: samples over which residuals may be correlated, for all groups or by group.
-        iterations: largest number of iterations.
+        folds: (blocks,) number of the fold of each block, from 0; default: each its own.
 
     """
-    active = (s != 0).any(axis=(0, 2))
-
-    def at(x):
-        theta = np.clip(base + s @ x, low, high)
-        raw = model(theta, active)
-        own, ratio = zip(*map(huber, raw[0]), strict=True)
-        return theta, own, [j * r for j, r in zip(raw[1], ratio, strict=True)], raw
-
-    def normal(slopes, residuals):
-        return (sum(part.T @ (j @ j.T) @ part for part, j in zip(s, slopes, strict=True)),
-                sum(part.T @ (j @ r) for part, j, r in zip(s, slopes, residuals, strict=True)))
-
-    def cost(x, residuals):
-        return sum(r @ r for r in residuals) + x @ x
-
-    damping, now = 0.01, at(x)
-    value, samples, converged = cost(x, now[1]), sum(map(len, now[1])), True
-    for _ in range(iterations if x.size else 0):
-        h, g = normal(now[2], now[1])
-        h, g = h + np.eye(len(x)), g + x
-        step = -np.linalg.solve(h + damping * np.diag(np.diag(h)), g)
-        tried = x + np.clip(step, -2.0, 2.0)
-        new = at(tried)
-        after = cost(tried, new[1])
-        if after < value:
-            fall, x, now, value = value - after, tried, new, after
-            damping = max(damping / 5, 1e-6)
-            if fall < CONVERGED * samples:
-                break
-        else:
-            damping *= 8
-            if damping > 1e5:
-                break
-    else:
-        converged = not x.size
-    theta, residuals, slopes, raw = now
-    return replace(_judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory),
-                   converged=converged)
-
-
-def _judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory):
-    """The fit with its curvature, its scatter and the prediction of each block by the others."""
+    active, size = (s != 0).any(axis=(0, 2)), s.shape[2]
     count = 1 + max(int(block.max(initial=0)) for block in blocks)
-    size = len(x)
-    parts, scores = np.zeros((count, size, size)), np.zeros((count, size))
-    # Units of one recording with other rates have their own samples.
-    series = {(group, len(r)): np.zeros((len(r), size))
-              for group, r in zip(groups, residuals, strict=True)}
-    for part, j, r, group, block in zip(s, slopes, residuals, groups, blocks, strict=True):
-        series[group, len(r)] += (j * r).T @ part
-        for b in range(count):
-            own = j[:, block == b]
-            parts[b] += part.T @ (own @ own.T) @ part
-            scores[b] += part.T @ (own @ r[block == b])
-    information = parts.sum(axis=0) + np.eye(size)
-    gradient = scores.sum(axis=0) + x
-    deviations = np.array([-np.linalg.solve(information - h, gradient - g)
-                           for h, g in zip(parts, scores, strict=True)]).reshape(count, size)
-    held = np.zeros(count)
-    for part, r, j, block in zip(s, *raw, blocks, strict=True):
-        moved = j.T @ (part @ deviations.T) if size else np.zeros((len(r), count))
-        held += np.bincount(block, huber(r + moved[np.arange(len(r)), block])[0]**2, count)
-    ratio, slow = 1.0, np.array([_slow(g) for g in series.values()])
+    folds = np.arange(count) if folds is None else folds
+    rows, limits = _bounds(base, s, low, high)
+
+    def parts(x):
+        """Theta; chi2, scores of each unit, information of each block; scores of stretches."""
+        theta = np.clip(base + s @ x, low, high)    # to rounding
+        chi2, scores, matrices = (np.zeros(shape) for shape in (
+            count, (len(s), count, size), (count, size, size)))
+        stretches = []
+        for u, (part, block, r, j) in enumerate(zip(s, blocks, *model(theta, active),
+                                                    strict=True)):
+            loss, ratio = huber(r)
+            own = part[active].T @ (j[active] * ratio)
+            chi2 += np.bincount(block, loss**2, count)
+            for b in np.unique(block):
+                mine = own[:, block == b]
+                scores[u, b] = mine @ loss[block == b]
+                matrices[b] += mine @ mine.T
+            stretches += [each.sum(axis=1)
+                          for each in np.array_split(own * loss, STRETCHES, axis=1)]
+        return theta, chi2, scores, matrices, np.array(stretches)
+
+    def local(x):
+        _, chi2, scores, matrices, _ = parts(x)
+        return ((chi2.sum() + x @ x) / 2, scores.sum(axis=(0, 1)) + x,
+                matrices.sum(axis=0) + np.eye(size))
+
+    converged = True
     if size:
-        inverse = np.linalg.inv(information)
-        spread = sum(_long_run(g, memory[group] if isinstance(memory, dict) else memory)
-                     for (group, _), g in series.items())
-        ratio = np.trace(inverse @ spread) / max(np.trace(inverse @ (information - np.eye(size))),
-                                                 1e-9)
-    return Fit(x, s, theta, float(sum(r @ r for r in residuals)), information, held, deviations,
-               float(max(ratio, 1.0)), slow)
+        x, converged = levenberg_marquardt(local, x, rows, limits)
+    theta, chi2, scores, matrices, stretches = parts(x)
+    h, room = matrices.sum(axis=0) + np.eye(size), rows @ x + limits
+    g = scores.sum(axis=(0, 1)) + x
+    inside = log_integral(h, g, rows, room)
+    prior = log_integral(np.eye(size), np.zeros(size), rows, limits)
+    out = [folds == fold for fold in range(folds.max() + 1)]
+    rests = [(h - matrices[part].sum(axis=0), g - scores[:, part].sum(axis=(0, 1)))
+             for part in out]
+    held = [-chi2[part].sum() / 2 + inside - log_integral(*rest, rows, room)
+            for part, rest in zip(out, rests, strict=True)]
+    return Fit(x, s, theta, float(chi2.sum()), h,
+               float(-(chi2.sum() + x @ x) / 2 + inside - prior), np.array(held),
+               np.array([bounded_step(*rest, rows, room) for rest in rests]),
+               max(_inflation(h, each) for each in (
+                   scores.reshape(len(s) * count, size), stretches)), converged)
 
 
-def _long_run(scores, memory):
-    """Variance (X, X) of the sum of correlated scores (n, X) (Newey and West 1987)."""
-    total = scores.T @ scores
-    for lag in range(1, min(memory, len(scores) - 1) + 1):
-        part = scores[lag:].T @ scores[:-lag]
-        total += (1 - lag / (memory + 1)) * (part + part.T)
-    return total
+def _inflation(h, scores):
+    """Mean variance of the estimates by the scatter of scores (K, X), over that by curvature."""
+    inverse = np.linalg.inv(h)
+    known = np.trace(inverse @ (h - np.eye(len(h))))
+    if known <= 0 or len(scores) < 2:
+        return 1.0
+    scatter = np.einsum('kx,xy,ky->', scores, inverse, scores) * len(scores) / (len(scores) - 1)
+    return float(max(scatter / known, 1.0))
 
 
-def _slow(scores):
-    """First cosine transforms (SLOWEST, X) of scores (n, X); each squared is a variance."""
-    n = len(scores)
-    waves = np.cos(np.pi * np.arange(1, SLOWEST + 1)[:, None] * (np.arange(n) + 0.5) / n)
-    return np.sqrt(2) * waves @ scores
+def _bounds(base, s, low, high):
+    """Rows (K, X) and limits (K,) of the bounds of theta, ``rows x + limits >= 0``."""
+    moved = (s != 0).any(axis=2)
+    rows = np.concatenate([s[moved], -s[moved]])
+    limits = np.concatenate([(base - low)[moved], (high - base)[moved]])
+    both = np.unique(np.column_stack([rows, limits]), axis=0)
+    return both[:, :-1], both[:, -1]

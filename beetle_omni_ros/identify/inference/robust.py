@@ -51,18 +51,3 @@ def interval(every: np.ndarray) -> np.ndarray:
     count = len(every) - 1
     half = student.ppf(0.975, count - 1) * np.sqrt((count - 1) * every[1:].var())
     return every[0] + half * np.array([-1, 1])
-
-
-def scatter(slopes: np.ndarray, residual: np.ndarray, prior: np.ndarray,
-            blocks: np.ndarray) -> np.ndarray:
-    """
-    (2, P, P) covariance of a fit, for white residuals and by the scatter between blocks (N,).
-
-    Use the larger variance, as few blocks can agree by chance. ``slopes`` (P, N) are derivatives
-    of the ``residual`` (N,) with unit variance; those of a prior are diagonal, (P,).
-    """
-    inverse = np.linalg.pinv(slopes @ slopes.T + np.diag(prior**2 + 1e-9))
-    scores = np.array([slopes[:, blocks == block] @ residual[blocks == block]
-                       for block in np.unique(blocks)])
-    between = scores.T @ scores * len(scores) / (len(scores) - 1)
-    return np.array([inverse, inverse @ between @ inverse])

@@ -7,11 +7,9 @@ the command times a gain of each window of time.
 """
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.stats import t as student
 
-from beetle_omni_ros.identify.inference.prior import Prior
-from beetle_omni_ros.identify.inference.robust import consecutive, huber, scatter
+from beetle_omni_ros.identify.inference.hierarchy import design, solve, Spread, WIDTH
+from beetle_omni_ros.identify.inference.robust import consecutive
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor.log import RotorLog
 
@@ -22,7 +20,7 @@ DEAD = 0.01             # [s] unit of the dead time
 PHASE = 3.0             # units by which the windows may shift
 BLOCKS = 20             # of a log, whose scatter gives the intervals
 LOOSE = 5.0             # ratio of interval's end and value, from which a log does not show a lag
-WEAK = 100.0            # deviation of a gain or ratio that a log does not show
+WIDE = (1.0, 1.0, 20.0, 1.0)    # prior standard deviations: time constants, dead time, gains
 STEP = 1e-4             # of differences
 PHASES = 10             # of the windows
 STRONG = 0.2            # share of the largest command, above which the gain of a window is used
@@ -94,73 +92,58 @@ def _fitted(log, base, rest, reason):
     """
     Time constants, dead time and gains together.
 
-    Points: mean of the logarithms of both time constants, half their difference, dead time (in a
-    log with windows also their phase), gains.
+    Parameters: mean of the logarithms of both time constants, half their difference, dead time (in
+    a log with windows their phase), gains in units of the largest thrust.
     """
     time, thrust = log.columns['time'], log.columns['thrust']
-    count, size = len(base) + 3, np.abs(thrust).max()
-    weak = Prior(np.append([np.inf, WEAK, np.inf], np.full(len(base), WEAK)))
-    low = np.array([LIMITS[0], -3, -PHASE if reason else 0, *[-9] * len(base)])
-    high = np.array([LIMITS[1], 3, 50, *[9] * len(base)])
-    blocks = consecutive(np.ones(len(time), dtype=bool), BLOCKS)
+    count, size, noise = len(base) + 3, np.abs(thrust).max(), np.std(thrust) / 5 + 1e-4
+    limits = [LIMITS, (-3, 3), (-PHASE, PHASE) if reason else (0, 50), *[(-9, 9)] * len(base)]
+    low, high = np.array(limits).T
+    centre = np.array([np.log(FIRST), 0, 0, *np.full(len(base), 0.5)])
+    blocks = [consecutive(np.ones(log.fresh.sum(), dtype=bool), BLOCKS)]
 
-    def model(points):
+    def predicted(points):
         lagged = respond(time, points[:, 3:] * size @ base + rest, *np.exp(
             [points[:, 0] + points[:, 1], points[:, 0] - points[:, 1]]))
         return np.array([np.interp(time - DEAD * dead, time, row)
                          for dead, row in zip(points[:, 2], lagged, strict=True)])
 
-    def residual(points, _):
-        return huber((thrust - model(points)) / noise)[0] * log.fresh
+    def model(theta, active):
+        moved = predicted(np.concatenate([theta, theta + STEP * np.eye(count)]))[:, log.fresh]
+        return [(moved[0] - thrust[log.fresh]) / noise], [(moved[1:] - moved[0]) / STEP / noise]
 
-    def slopes(points, start, free):
-        moved = residual((points[:, None] + STEP * np.eye(count)).reshape(-1, count), None)
-        return (moved.reshape(len(points), count, -1) - start[:, None]) / STEP * free[:, None]
+    def fit(active, starts):
+        s = design([Spread(wide, {}) for wide in WIDE[:3] + WIDE[3:] * len(base)],
+                   {'log': (0,)}, active)
+        tried = [solve(model, centre[None], s, (start - centre)[active] / s[0].sum(axis=1)[active],
+                       blocks, low, high) for start in starts]
+        return min(tried, key=lambda one: one.chi2 + one.x @ one.x)
 
-    def solve(points, fixed):
-        free = ~np.isin(np.arange(count), fixed)
-
-        def full(part):
-            point = points[:1].copy()
-            point[0, free] = part
-            return point
-
-        def errors(part):
-            return np.append(residual(full(part), None), weak.residual(full(part))[0, free])
-
-        def derivatives(part):
-            point = full(part)
-            moved = slopes(point, residual(point, None), free)[0, free]
-            return np.vstack([moved.T, np.diag(weak.slope(point)[0, free])])
-
-        fits = [least_squares(errors, start, derivatives, (low[free], high[free]), x_scale='jac',
-                              max_nfev=60) for start in np.clip(points, low, high)[:, free]]
-        best = full(min(fits, key=lambda one: one.cost).x)
-        error = residual(best, None)
-        return best, scatter(slopes(best, error, free)[0], error[0], weak.slope(best[0]), blocks)
-
-    points = np.tile([np.log(FIRST), 0, 0, *np.full(len(base), 0.5)], (len(STARTS), 1))
-    points[:, 2] = np.array(STARTS) / DEAD * (not reason)
-    noise, fixed = np.std(thrust) / 5 + 1e-4, np.zeros(0)
+    free = np.ones(count, dtype=bool)
+    starts = np.tile(centre, (len(STARTS), 1))
+    starts[:, 2] = np.array(STARTS) / DEAD * (not reason)
     for _ in range(3):
-        points, wide = solve(points, fixed)
-        noise = np.std((thrust - model(points)[0])[log.fresh]) + 1e-4
-    dead = None if reason else _shown(points[0, 2], wide, np.eye(count)[2], DEAD)
+        best = fit(free, starts)
+        starts = best.theta
+        rms = noise = np.std((thrust - predicted(starts)[0])[log.fresh]) + 1e-4
+    noise *= np.sqrt(best.inflation)
+    best = fit(free, starts)
+    dead = None if reason else _shown(best, np.eye(count)[2], DEAD)
     if dead and dead['interval'][0] <= 0:       # not shown by the log: the lags without it
-        dead['interval'][0], points[0, 2], fixed = 0.0, 0, np.array([2])
-        points, wide = solve(points, fixed)
-    same, wide_same = solve(points * np.array([1, 0, *np.ones(count - 2)]), [1, *fixed])
+        dead['interval'][0], free[2] = 0.0, False
+        best = fit(free, best.theta)
     mean, half = np.eye(count)[:2]
-    return {'log': log.name, **(_shown(same[0, 0], wide_same, mean) or {}),
-            'up': _shown(points[0] @ (mean + half), wide, mean + half),
-            'down': _shown(points[0] @ (mean - half), wide, mean - half), 'dead_time': dead,
+    same = fit(free & (half == 0), best.theta)
+    return {'log': log.name, **(_shown(same, mean) or {}), 'up': _shown(best, mean + half),
+            'down': _shown(best, mean - half), 'dead_time': dead,
             'from_rest': bool(rest.any() and abs(rest[0]) < 0.05 * thrust.max()),
-            'rms_N': float(noise), 'reason': reason, 'fitted': model(points)[0]}
+            'rms_N': float(rms), 'reason': reason, 'fitted': predicted(best.theta)[0]}
 
 
-def _shown(value, wide, direction, unit=None):
+def _shown(fit, direction, unit=None):
     """Value and interval along a direction; of a logarithm without ``unit``; None: not shown."""
-    half = np.sqrt(np.max(direction @ wide @ direction)) * student.ppf(0.975, BLOCKS - 1)
+    value = fit.theta[0] @ direction
+    half = WIDTH * np.sqrt(direction @ fit.spread()[0] @ direction)
     ends = np.array([value, value - half, value + half])
     if unit is None and half > np.log(LOOSE):
         return None

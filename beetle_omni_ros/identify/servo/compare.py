@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import norm
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.flights.text import summary
@@ -21,7 +20,7 @@ from beetle_omni_ros.identify.servo.fit import (
     select,
     Servos,
 )
-from beetle_omni_ros.identify.servo.joint import ALWAYS, identify, joint_results
+from beetle_omni_ros.identify.servo.joint import identify, joint_results, separating_sine
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX, NAMES, with_encoder_errors
 from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
@@ -29,17 +28,10 @@ from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag import BagError, read_messages
 
-# [nat] gain of evidence of a named entry: a Bayes factor of 150, "very strong" in the scale of
-# Kass and Raftery (1995).
-CERTAIN = 5.0
+ALPHA = 0.05        # probability of a wrong name, if each entry has the same prior probability
 STEP = 1e-3         # of derivatives by the coordinates of a fit, in standard deviations
 NAMED = [name for name in ENTRIES if name in CATALOGUE]
-# Rows of a comparison of two logs. A log without a torque determines the dead band (friction over
-# stiffness) and the lag behind a ramp better than the parameters that they consist of.
-ROWS = (('joint_bandwidth', 'kp', 'N m/rad'), ('joint_bandwidth', 'kd', 'N m s/rad'),
-        ('joint_command_latency', 'delay', 's'), ('joint_command_latency', 'ramp_lag', 's'),
-        ('joint_friction', 'coulomb', 'N m'), ('joint_friction', 'dead_band', 'rad'),
-        ('joint_offset', 'offset', 'rad'))
+CERTAIN = np.log(len(NAMED) / ALPHA)    # [nat] gain of evidence of a named entry
 
 
 def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: RobotParameters,
@@ -60,14 +52,11 @@ def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: Rob
     others = [read_joint_log(path) for path in [*runs[1:], *holdout]]
     found, apart = compare(log, robot), identify([log], robot)
     result, joints = gap_of(found, apart, robot), joint_results(apart, others, robot)
-    result['changes'] = [row for other in others for row in changes(log, other, robot)]
     result['joints'], result['text'] = joints['joints'], joints['text']
     sets = any(len(effect['names']) > 1 for effect in result['effects'])
-    plan = joints['joints'][0]['experiment']
-    result |= {'next_experiment': (
-        f'sine of {plan["frequency_Hz"]:g} Hz and {plan["amplitude_rad"]:.2f} rad for '
-        f'{plan["duration_s"]:g} s on the joints (separates latency from bandwidth)'
-        if sets else None),
+    result |= {'next_experiment': 'sine of {frequency_Hz:.1f} Hz and {amplitude_rad:.2f} rad for '
+               '{duration_s:g} s on the joints (separates latency from bandwidth)'.format(
+                   **separating_sine()) if sets else None,
         'meta': {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                  'robot': str(base) if base else 'params/robot.yaml', 'version': __version__}}
     result['summary'] = summary(result)
@@ -111,7 +100,7 @@ def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
 
     """
     log, units = found.servos.logs[0], range(len(found.servos.units))
-    last = slice(log.end_of(shipped().servo.fitted), None)
+    last = slice(log.end, None)
     numbers = [number for *_, number in found.servos.units]
     before, after, floor = (
         np.array([error_rms(log, u, sets[u], part=last) for u in units])
@@ -148,15 +137,13 @@ def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
 
 def _evidence(found, name):
     """Evidence of an entry: with the others of the selected model, against that model without."""
-    gain, trial = found.gains[name], found.trials[name]
     sign = 1 if name in found.chosen.entries else -1
-    held = sign * (trial.fit.held - found.chosen.fit.held) / found.servos.inflation
-    error = held.std(ddof=1) * np.sqrt(len(held))
-    return {'delta_bic': 2 * gain,      # both approximate twice the logarithm of a Bayes factor
-            'delta_chi2': sign * (trial.fit.chi2 - found.chosen.fit.chi2)
-            / found.servos.inflation,
-            'cv_gain': float(held.sum()),
-            'cv_gain_se': float(held.sum() / error) if error else 0.0,
+    on, off = found.chosen.fit, found.trials[name].fit
+    held = sign * (on.held - off.held)
+    total = 2 * float(held.sum())
+    return {'delta_bic': 2 * found.gains[name],     # twice the logarithm of a Bayes factor
+            'delta_chi2': sign * (off.chi2 - on.chi2), 'cv_gain': total,
+            'cv_gain_se': float(np.copysign(np.sqrt(abs(total)), total)),
             'blocks_positive': int((held > 0).sum())}
 
 
@@ -208,8 +195,8 @@ def _rivals(found, name):
                   if rival in NAMED and rival not in entries and rival in found.trials):
         swapped = s.fit([*(e for e in entries if e != name), other],
                         starts=(found.trials[other], found.full), still=found.chosen.still)
-        if s.evidence(swapped) > s.evidence(found.chosen) - CERTAIN:
-            rivals[other] = s.evidence(swapped)
+        if swapped.fit.evidence > found.chosen.fit.evidence - CERTAIN:
+            rivals[other] = swapped.fit.evidence
             found.trials[other] = swapped
     return sorted(rivals, key=lambda other: -rivals[other])
 
@@ -269,51 +256,3 @@ def _derived(trial, unit, function):
         moved[p] += step
         slopes[p] = (function(decoded(moved)) - value) / step
     return float(value), float(np.sqrt(slopes @ covariance @ slopes))
-
-
-def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[dict]:
-    """
-    Compare the servos of two logs; the robot file is the centre of both priors.
-
-    Returns:
-        a row for each joint of both logs and each of ``ROWS``: second ``log``, ``joint``, ``name``
-        of the catalogue entry, ``parameter``, ``unit``, ``before``, ``after``, ``difference``, its
-        95 % ``interval``, and ``significant``: at most 5 % of pairs of logs without a change have
-        any significant row. An angle must change by an encoder count.
-
-    """
-    entries = [*ALWAYS, 'joint_offset']
-    fits = []
-    for log in (before, after):
-        s = Servos([log], file_sets(robot))
-        full = s.estimate_noise(s.candidates())
-        chosen = s.fit(entries, starts=(full,))
-        fits.append(Found(s, full, chosen, {}, {}))
-    joints, count = [j for j in before.joints if j in after.joints], before.quantum
-    rows, least = [], norm.isf(0.05 / 2 / max(len(joints) * len(ROWS), 1))
-    for number in joints:
-        for name, parameter, unit in ROWS:
-            (old, spread), (new, other) = (
-                _derived(f.chosen, f.servos.logs[0].joints.index(number),
-                         lambda values: row_value(values, robot, name, parameter)) for f in fits)
-            error, difference = float(np.hypot(spread, other)), new - old
-            rows.append({'log': after.name, 'joint': number, 'name': name,
-                         'parameter': parameter, 'unit': unit, 'before': old, 'after': new,
-                         'difference': difference,
-                         'interval': [difference - WIDTH * error, difference + WIDTH * error],
-                         'significant': bool(abs(difference) > max(
-                             least * error, count if unit == 'rad' else 0.0))})
-    return rows
-
-
-def row_value(values: np.ndarray, robot: RobotParameters, name: str, parameter: str) -> float:
-    """A parameter of ``ROWS`` for one parameter set (P,)."""
-    if parameter == 'dead_band':
-        return float(values[INDEX['coulomb_friction']])
-    if parameter == 'delay':        # all of it, not only what a file states
-        return float(values[INDEX['delay']])
-    own = catalogue_values(values, robot)
-    if parameter == 'ramp_lag':
-        return float(values[INDEX['delay']] + 2 * values[INDEX['damping_ratio']]
-                     / values[INDEX['natural_frequency']])
-    return float(own[name][parameter])

@@ -7,15 +7,16 @@ one type share their values, and each has its own deviation. Two logs differ in 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
 from scipy.stats import chi2
 
 from beetle_omni_ros.identify.inference.hierarchy import design, Fit, solve
+from beetle_omni_ros.identify.inference.noise import Drifting, drifting
+from beetle_omni_ros.identify.inference.robust import HUBER, scale_of
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.identify.servo.model import (
@@ -29,7 +30,8 @@ from beetle_omni_ros.identify.servo.robot import ENTRIES, LIMITS
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 LOGARITHMIC = np.array([term.logarithmic for term in TERMS.values()])
-STEP = np.where(LOGARITHMIC, 0.01, 2e-4)      # of the derivatives
+# Of the derivatives: over the kinks of friction and of held commands.
+STEP = np.where(LOGARITHMIC, 0.03, 6e-4)
 LATE = 0.03         # [s] of a reading behind its command, about
 MOMENTS = np.linspace(-0.4, 0.0, 9)     # [s] of commands that determine the kind of motion
 # Starts of terms whose chi2 has several minima, or no slope at zero.
@@ -94,15 +96,12 @@ class Servos:
     Args:
         logs: response logs.
         base: (J, P) parameter sets of gimbal1 to gimbal4 from which the fits deviate.
-        fitted: fraction of each log that is fitted; by default that of params/identify.yaml.
         one_delay: whether all joints have the same delay, as in a robot file.
 
     """
 
-    def __init__(self, logs: Sequence[JointLog], base: np.ndarray, fitted: float | None = None,
-                 one_delay: bool = False):
+    def __init__(self, logs: Sequence[JointLog], base: np.ndarray, one_delay: bool = False):
         p = shipped().servo
-        fitted = p.fitted if fitted is None else fitted
         self.logs = list(logs)
         self.units = [(k, j, number) for k, log in enumerate(logs)
                       for j, number in enumerate(log.joints)]
@@ -113,20 +112,18 @@ class Servos:
             self.spreads[INDEX['delay']] = replace(delay, groups={'log': delay.groups['log']})
         self.labels: dict[str, Sequence] = {'joint': [number for *_, number in self.units],
                        'log': [k for k, *_ in self.units], 'unit': self.units}
-        self.rows = []
-        self._parts = [log.first(fitted) for log in self.logs]
-        for log in self.logs:
-            settled = log.t >= log.t[0] + p.settling
-            rows = np.flatnonzero(log.fresh & settled & (np.arange(len(log.t))
-                                                         < int(round(fitted * len(log.t)))))
-            self.rows.append(rows)
+        self._parts = [log.first() for log in self.logs]
+        self.rows = [np.flatnonzero((log.fresh & (log.t >= log.t[0] + p.settling))[:log.end])
+                     for log in self.logs]
         self.low = LOW.copy()
         self.sigma = np.full(len(self.units), p.first_noise)
-        self._blocks = kinds_of_motion([(self.logs[k], j, self.rows[k]) for k, j, _ in self.units],
-                                       p.blocks)
-        self.inflation = 1.0
-        self.memory = {k: round(p.memory / float(np.median(np.diff(log.read_t[log.fresh]))))
-                       for k, log in enumerate(self.logs)}
+        self.noise = [Drifting(len(rows)) for rows in self.rows]
+        kinds = kinds_of_motion([(self.logs[k], j, self.rows[k]) for k, j, _ in self.units],
+                                p.blocks)
+        self.blocks = [kind + p.blocks * k for kind, (k, *_) in zip(kinds, self.units,
+                                                                    strict=True)]
+        # Each log is predicted from the others, or each kind of motion of one or two logs.
+        self.folds = np.arange(p.blocks * len(logs)) // (p.blocks if len(logs) > 2 else 1)
 
     # ---- model of the core
     def __call__(self, theta: np.ndarray, active: np.ndarray):
@@ -134,13 +131,14 @@ class Servos:
         residuals, slopes = [], []
         for k, log in enumerate(self.logs):
             mine = np.flatnonzero(np.array(self.labels['log']) == k)
-            read, change = self._readings(k, theta[mine], active)
-            sigma = self.sigma[mine, None]
-            residuals += list((read - log.measured[:, self.rows[k]]) / sigma)
-            slopes += list((change / sigma).transpose(1, 0, 2))
+            read, change = self.readings(k, theta[mine], active)
+            both = np.concatenate([(read - log.measured[:, self.rows[k]])[None], change])
+            white = self.noise[k].whitened((both / self.sigma[mine, None]).transpose(2, 1, 0))
+            residuals += list(white[:, :, 0].T)
+            slopes += list(white[:, :, 1:].transpose(1, 2, 0))
         return residuals, slopes
 
-    def _readings(self, k, theta, active):
+    def readings(self, k, theta, active):
         """Readings (J, n) and their derivatives (P, J, n) at the fitted rows of a log."""
         log, rows, count = self.logs[k], self.rows[k], len(theta)
         moved = [p for p in np.flatnonzero(active) if NAMES[p] not in READING_ERRORS]
@@ -161,22 +159,29 @@ class Servos:
         return read[0], change
 
     # ---- fits
-    def estimate_noise(self, entries: Sequence[str]) -> Trial:
+    def estimate_noise(self, entries: Sequence[str], start=()) -> Trial:
         """
-        Measure the noise around the most flexible model; call it before :meth:`fit`.
+        Measure the noise around a model; call it before :meth:`fit`.
 
-        The errors are those of the free simulation, so they include what no term describes. They
-        are correlated, hence :attr:`inflation`.
+        The errors are those of the free simulation, so they include what no term describes. It
+        depends on the motion, so that it does not average out over more periods. The noise is
+        therefore inflated by the scatter of the scores between kinds of motion.
         """
-        trial = self.fit(entries)
-        for k in range(3):
-            trial = self.fit(entries, starts=(trial,)) if k else trial
-            residuals, _ = self(trial.fit.theta, np.zeros(len(NAMES), dtype=bool))
-            least = [self.logs[k].quantum / np.sqrt(12) for k, *_ in self.units]
-            self.sigma = np.maximum(self.sigma * [1.4826 * np.median(np.abs(r)) if len(r) else 1.0
-                                                  for r in residuals], least)
-        self.inflation = trial.fit.inflation
-        return trial
+        trial, active = self.fit(entries, start), mask(entries)
+        for _ in range(2):
+            for k, log in enumerate(self.logs):
+                mine = np.flatnonzero(np.array(self.labels['log']) == k)
+                read, change = self.readings(k, trial.fit.theta[mine], active)
+                signals = [slopes.T @ part for slopes, part in zip(
+                    change.transpose(1, 0, 2), trial.fit.s[mine], strict=True)]
+                errors = read - log.measured[:, self.rows[k]]
+                clipped = [np.clip(e, -HUBER * scale_of(e), HUBER * scale_of(e)) for e in errors]
+                self.noise[k], sigma = drifting([e - a @ trial.fit.x for e, a in zip(
+                    clipped, signals, strict=True)], signals, self._slowest(k))
+                self.sigma[mine] = np.maximum(sigma, log.quantum / np.sqrt(12))
+            trial = self.fit(entries, starts=(trial,))
+        self.sigma *= np.sqrt(trial.fit.inflation)
+        return self.fit(entries, starts=(trial,))
 
     def fit(self, entries: Sequence[str], starts: Sequence = (),
             still: np.ndarray | None = None) -> Trial:
@@ -200,19 +205,15 @@ class Servos:
             if isinstance(start, Trial):
                 target[:, active] = start.fit.theta[:, active]
             else:
-                limits = {term: self._reached(term) for term in ('velocity_limit', 'torque_limit')}
-                for name, value in (start | limits).items():
+                limits = [log.reached() for log in self._parts]
+                start = start | {name: max(one[name] for one in limits) for name in limits[0]}
+                for name, value in start.items():
                     p = INDEX[name]
                     if active[p]:
                         target[:, p] = np.log(value) if LOGARITHMIC[p] else value
             x = self._nearest(s, target)
-            fits.append(solve(self, self.base, s, x, self.labels['log'], self._blocks, self.low,
-                              HIGH, self.memory))
+            fits.append(solve(self, self.base, s, x, self.blocks, self.low, HIGH, self.folds))
         return Trial(tuple(entries), min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x), still)
-
-    def evidence(self, trial: Trial) -> float:
-        """Logarithm of the evidence [nat] of a trial."""
-        return trial.fit.evidence(self.inflation)
 
     def visible(self, one: Trial, other: Trial) -> np.ndarray:
         """
@@ -236,6 +237,19 @@ class Servos:
                          for o, c in zip(off, spread, strict=True)])
         return size > chi2.isf(0.05 / len(off), terms.sum())
 
+    def determined(self, trial: Trial, entry: str) -> bool:
+        """Whether the logs halve the variance of every combination of an entry's terms."""
+        s, terms = trial.fit.s, mask([entry])
+        prior, left = (each[:, terms][:, :, terms]
+                       for each in (s @ s.transpose(0, 2, 1), trial.fit.spread()))
+        return bool(np.linalg.eigvals(np.linalg.solve(prior, left)).real.max() < 0.5)
+
+    def _slowest(self, k):
+        """Number of cosines over the fitted part of a log with a quarter of its motion's rate."""
+        command = self.logs[k].command[:, self.rows[k]]
+        turns = np.diff(command > command.mean(axis=1, keepdims=True), axis=1).sum(axis=1)
+        return int(turns.min()) // 4
+
     def _nearest(self, s, target):
         """Standardised values x with base + S x near a target, of least norm."""
         if not s.shape[2]:
@@ -244,12 +258,6 @@ class Servos:
         off = (target - self.base).ravel()
         return np.linalg.solve(flat.T @ flat + 1e-6 * np.trace(flat.T @ flat) / len(flat.T)
                                * np.eye(len(flat.T)), flat.T @ off)
-
-    def _reached(self, name):
-        """Largest speed [rad/s], or position error [rad], of the fitted parts."""
-        if name == 'velocity_limit':
-            return max(log.speed().max() for log in self._parts)
-        return max(np.abs(log.command - log.measured).max() for log in self._parts)
 
     def candidates(self) -> list[str]:
         """Entries that these logs can show: a limit only if the commands exceed it."""
@@ -288,35 +296,38 @@ class Found:
 
 
 def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least: float = 0.0,
-           named: bool = False, after: Mapping[str, str] = MappingProxyType({})) -> Found:
+           named: bool = False) -> Found:
     """
     Add the entries that raise the evidence, largest gain first, and remove those that do not.
 
-    An entry must also improve the prediction of left-out kinds of motion in total.
+    An entry must also improve the prediction of left-out kinds of motion in total. In a model for
+    other motions (``named`` is False) the logs must determine each of its terms.
 
     Args:
         servos: logs and base values.
-        always: entries of every model.
+        always: entries of every model, whose errors are the noise; without, that of all entries.
         allowed: further entries.
         least: least gain of evidence [nat] of an entry.
         named: whether an entry must also change some joint's fit by an encoder count (RMS). An
             entry of each joint stays at the base where it does not change the fit.
-        after: entry -> the entry that it presupposes.
 
     """
     candidates = [name for name in servos.candidates() if name in {*always, *allowed}]
     full = servos.estimate_noise(candidates)
-    gain = servos.evidence
-    chosen = servos.fit(always, starts=(full, *STARTS) if always else (full,))
+    chosen = servos.estimate_noise(always, (full, *STARTS)) if always else servos.fit((), (full,))
 
     def worth(more, fewer):
         return (gain(more) >= gain(fewer) + least
-                and more.fit.held.sum() < fewer.fit.held.sum())
+                and more.fit.held.sum() > fewer.fit.held.sum()
+                and (named or all(servos.determined(more, name) for name in more.entries
+                                  if name not in fewer.entries)))
+
+    def gain(trial):
+        return trial.fit.evidence
 
     while True:
         trials = {name: servos.fit([*chosen.entries, name], starts=(chosen, full))
-                  for name in candidates if name not in chosen.entries
-                  and after.get(name) in (None, *chosen.entries)}
+                  for name in candidates if name not in chosen.entries}
         better = [trial for trial in trials.values() if worth(trial, chosen)]
         if not better:
             break
@@ -324,8 +335,7 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
     while True:
         without = {name: servos.fit([other for other in chosen.entries if other != name],
                                     starts=(chosen, full), still=chosen.still)
-                   for name in chosen.entries
-                   if name not in {*always, *map(after.get, chosen.entries)}}
+                   for name in chosen.entries if name not in always}
         useless = [name for name, fewer in without.items() if not worth(chosen, fewer)
                    or named and not servos.visible(chosen, fewer).any()]
         if useless:

@@ -44,8 +44,7 @@ class JointLog:
     start_velocity: np.ndarray = field(init=False)
     _command_t: np.ndarray = field(init=False, repr=False)
     _command: np.ndarray = field(init=False, repr=False)
-    _once: np.ndarray = field(init=False, repr=False)
-    _twice: np.ndarray = field(init=False, repr=False)
+    _total: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self):
         """Derive sampling period [s], first positions [rad] and velocities [rad/s]."""
@@ -61,13 +60,9 @@ class JointLog:
         before = self.command[:, :1] + slope[:, None] * back
         command_t = np.concatenate([self.t[0] + back, self.t])
         command = np.concatenate([before, self.command], axis=1)
-        # First and second integral of the held command.
-        steps = np.diff(command_t)
-        once = np.cumsum(command[:, :-1] * steps, axis=1)
-        once = np.concatenate([np.zeros((len(command), 1)), once], axis=1)
-        twice = np.cumsum(once[:, :-1] * steps + command[:, :-1] * steps**2 / 2, axis=1)
-        twice = np.concatenate([np.zeros((len(command), 1)), twice], axis=1)
-        known = {'_once': once, '_twice': twice, 'period': period, 'fresh': fresh,
+        total = np.cumsum(command[:, :-1] * np.diff(command_t), axis=1)
+        total = np.concatenate([np.zeros((len(command), 1)), total], axis=1)
+        known = {'_total': total, 'period': period, 'fresh': fresh,
                  'read_t': read_t, 'start': first[2], 'start_velocity': first[1],
                  '_command_t': command_t, '_command': command}
         for name, value in known.items():
@@ -77,36 +72,22 @@ class JointLog:
         """Command of a joint (index) by linear interpolation [rad]; linear before the log."""
         return np.interp(times, self._command_t, self._command[joint])
 
-    def held_command(self, joint: int, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Command held between rows, over equal steps.
-
-        Args:
-            joint: index of the joint.
-            edges: (K + 1,) evenly spaced times [s].
-
-        Returns:
-            (K,) mean over each step; (K,) first moment: the mean of (command - mean) (1/2 -
-            relative time in the step) [rad].
-
-        """
+    def held_command(self, joint: int, edges: np.ndarray) -> np.ndarray:
+        """Means (K,) over the steps between ``edges`` (K + 1,) of the command held until a row."""
         row = np.maximum(np.searchsorted(self._command_t, edges, side='right') - 1, 0)
-        since, command = edges - self._command_t[row], self._command[joint, row]
-        once = self._once[joint, row] + command * since
-        twice = self._twice[joint, row] + self._once[joint, row] * since + command * since**2 / 2
-        step = edges[1] - edges[0]
-        mean = np.diff(once) / step
-        return mean, (np.diff(twice) - step * once[:-1]) / step**2 - mean / 2
+        total = self._total[joint, row] + self._command[joint, row] * (
+            edges - self._command_t[row])
+        return np.diff(total) / np.diff(edges)
 
-    def first(self, part: float) -> JointLog:
-        """The first ``part`` of the log."""
-        end = self.end_of(part)
-        return JointLog(self.name, self.t[:end], self.joints, self.measured[:, :end],
-                        self.command[:, :end])
+    @property
+    def end(self) -> int:
+        """Number of samples of the fitted part; the others are held out."""
+        return int(round(shipped().servo.fitted * len(self.t)))
 
-    def end_of(self, part: float) -> int:
-        """Number of samples in the first ``part``."""
-        return int(round(part * len(self.t)))
+    def first(self) -> JointLog:
+        """The fitted part of the log."""
+        return JointLog(self.name, self.t[:self.end], self.joints, self.measured[:, :self.end],
+                        self.command[:, :self.end])
 
     @property
     def quantum(self) -> float:
@@ -132,6 +113,11 @@ class JointLog:
         span = max(1, int(round(0.05 / self.period)))
         travel = np.abs(self.measured[:, span:] - self.measured[:, :-span])
         return (travel / (self.t[span:] - self.t[:-span])).max(axis=1)
+
+    def reached(self) -> dict[str, float]:
+        """Largest speed [rad/s] and position error [rad]: a limit is not below them."""
+        return {'velocity_limit': float(self.speed().max()),
+                'torque_limit': float(np.abs(self.command - self.measured).max())}
 
 
 def quantum(measured: np.ndarray) -> float:

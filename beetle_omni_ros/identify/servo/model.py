@@ -23,7 +23,7 @@ from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.robot.native import built, EXACT, generated
 from beetle_omni_ros.robot.parameters import JointParameters
 from beetle_omni_ros.robot.schema import RunError
-from beetle_omni_ros.robot.servo import CASADI, NUMPY, play, Servo, Step
+from beetle_omni_ros.robot.servo import CASADI, play, Servo, Step
 
 LONGEST_STEP = 0.0025   # [s]; relative error of the frequency (wn step)^2 / 24: 0.3 % at 100 rad/s
 NEVER = 1e3             # value of a limit without effect
@@ -105,18 +105,17 @@ OFF = np.array([term.off for term in TERMS.values()])
 STEP_TERMS = tuple(name for name, term in TERMS.items() if term.in_step)
 # Arrays (steps, sets), states (steps + 1, sets), numbers (NUMBERS, sets).
 LOOP = """
-void servo_run(long steps, long sets, double step, const double *command, const double *early,
-         const double *numbers, double *middle, double *velocity) {
+void servo_run(long steps, long sets, double step, const double *command, const double *numbers,
+         double *middle, double *velocity) {
     const double *arguments[ARGUMENTS];
     double *results[RESULTS], work[WORK];
     for (long at = 0; at < steps * sets; at++) {
         arguments[0] = command + at;
-        arguments[1] = early + at;
-        arguments[2] = middle + at;
-        arguments[3] = velocity + at;
-        arguments[4] = &step;
+        arguments[1] = middle + at;
+        arguments[2] = velocity + at;
+        arguments[3] = &step;
         for (long k = 0; k < NUMBERS; k++)
-            arguments[5 + k] = numbers + k * sets + at % sets;
+            arguments[4 + k] = numbers + k * sets + at % sets;
         results[0] = middle + at + sets;
         results[1] = velocity + at + sets;
         servo_step(arguments, results, 0, work, 0);
@@ -159,11 +158,9 @@ def simulate(log: JointLog, joint: np.ndarray | int, sets: np.ndarray,
     times = np.maximum(np.where(log.fresh, log.read_t, log.t), log.t[0])
     count = int(np.ceil((times.max() - log.t[0]) / step - 1e-6))
     value = dict(zip(NAMES, sets.T, strict=True))
-    command, early = _commands(log, joint, value['delay'], log.t[0] + step * np.arange(count + 1),
-                               held)
-    command += value['offset']
-    positions = _integrate(value, command, early, log.start[joint].copy(),
-                           log.start_velocity[joint].copy(), step)
+    command = _commands(log, joint, value['delay'], log.t[0] + step * np.arange(count + 1), held)
+    positions = _integrate(value, command + value['offset'], log.start[joint],
+                           log.start_velocity[joint], step)
     return with_encoder_errors(_at_samples(positions, (times - log.t[0]) / step), value)
 
 
@@ -177,71 +174,53 @@ def with_encoder_errors(positions: np.ndarray, value: dict[str, np.ndarray]) -> 
 
 
 def _commands(log, joint, delay, edges, held):
-    """Mean and first moment (K, B) of delayed commands, computed once for equal delays."""
+    """Means (K, B) of delayed commands over steps, computed once for equal delays."""
     keys, which = np.unique(np.stack([joint, delay]), axis=1, return_inverse=True)
-    if held:
-        parts = [log.held_command(int(j), edges - d) for j, d in keys.T]
-    else:
-        middle = (edges[1:] + edges[:-1]) / 2
-        parts = [(log.command_at(int(j), middle - d), np.zeros(len(middle))) for j, d in keys.T]
-    mean, early = (np.stack(column, axis=1) for column in zip(*parts, strict=True))
-    return mean[:, which.ravel()], early[:, which.ravel()]
+    middle = (edges[1:] + edges[:-1]) / 2
+    means = [log.held_command(int(j), edges - d) if held else log.command_at(int(j), middle - d)
+             for j, d in keys.T]
+    return np.stack(means, axis=1)[:, which.ravel()]
 
 
-def _integrate(value, command, early, q, v, step):
-    """Positions (K + 1, B); ``early``: first moment of the command in each step."""
+def _integrate(value, command, q, v, step):
+    """Positions (K + 1, B) of held commands (K, B)."""
     # Leapfrog: positions are half a step ahead of velocities.
     middle, velocity = np.empty((2, len(command) + 1, len(q)))
     middle[0], velocity[0] = q + 0.5 * step * v, v
+    numbers = np.ascontiguousarray([value[name] for name in STEP_TERMS])
     if (run := _compiled()) is not None:
-        run(*command.shape, step, *(np.ascontiguousarray(x) for x in (
-            command, early, [value[name] for name in STEP_TERMS])), middle, velocity)
+        run(*command.shape, step, np.ascontiguousarray(command), numbers, middle, velocity)
     else:
-        acting = {name: value[name] if (value[name] != TERMS[name].off).any() else None
-                  for name in STEP_TERMS}
-        advance = _advance(NUMPY, acting, step)
-        for k, (target, part) in enumerate(zip(command, early, strict=True)):
-            middle[k + 1], velocity[k + 1] = advance(target, part, middle[k], velocity[k])
+        advance = _advance().map(len(q))
+        for k, target in enumerate(command):
+            middle[k + 1], velocity[k + 1] = (moved.full().ravel() for moved in advance(
+                *(row[None] for row in (target, middle[k], velocity[k], np.full(len(q), step),
+                                        *numbers))))
     positions = middle - 0.5 * step * velocity
     return play(positions, value['backlash']) if value['backlash'].any() else positions
 
 
-def _advance(space, value, step):
-    """Function of one step; a ``value`` of None has no effect."""
+@cache
+def _advance() -> ca.Function:
+    """One step: command, position, velocity, step and ``STEP_TERMS`` -> position, velocity."""
+    target, here, before, step = (ca.SX.sym(name) for name in (
+        'target', 'here', 'before', 'step'))
+    value = {name: ca.SX.sym(name) for name in STEP_TERMS}
     stiffness = value['natural_frequency']**2
-    damping = 2 * value['damping_ratio'] * value['natural_frequency']
-    torque, speed = value['torque_limit'], value['velocity_limit']
-    coulomb, above, sine, cosine = (
-        0.0 if value[name] is None else value[name] * stiffness
-        for name in ('coulomb_friction', 'stiction', 'load_sine', 'load_cosine'))
-    loaded = value['load_sine'] is not None or value['load_cosine'] is not None
-    has_friction = value['coulomb_friction'] is not None or value['stiction'] is not None
-    move = Step(space, Servo(
-        1.0, stiffness, damping, speed, None if torque is None else torque * stiffness,
-        coulomb=coulomb if has_friction else None, stiction=coulomb + above), step)
-    jump = move.gain * stiffness * step
-
-    def advance(target, early, here, before):
-        load = -sine * space.sin(here) - cosine * (space.cos(here) - 1) if loaded else None
-        after = move.kick(target, here, before, load)
-        # The first moment has no effect on a joint held by friction or at a limit.
-        free = after != 0
-        if speed is not None:
-            free = free * (space.maximum(after, -after) < speed)
-        if torque is not None:
-            error = target - here
-            free = free * (space.maximum(error, -error) < torque)
-        return here + step * after + jump * early * free, after
-    return advance
+    coulomb, above, sine, cosine, torque = (value[name] * stiffness for name in (
+        'coulomb_friction', 'stiction', 'load_sine', 'load_cosine', 'torque_limit'))
+    move = Step(CASADI, Servo(
+        1.0, stiffness, 2 * value['damping_ratio'] * value['natural_frequency'],
+        value['velocity_limit'], torque, coulomb=coulomb, stiction=coulomb + above), step)
+    after = move.kick(target, here, before, -sine * ca.sin(here) - cosine * (ca.cos(here) - 1))
+    return ca.Function('servo_step', [target, here, before, step, *value.values()],
+                       [here + step * after, after])
 
 
 @cache
 def _compiled() -> Callable | None:
-    """All steps of all sets in C; None without a compiler, then numpy is used."""
-    step, *state = (ca.SX.sym(name) for name in ('step', 'target', 'early', 'here', 'before'))
-    numbers = [ca.SX.sym(name) for name in STEP_TERMS]
-    advance = ca.Function('servo_step', [*state, step, *numbers], list(
-        _advance(CASADI, dict(zip(STEP_TERMS, numbers, strict=True)), step)(*state)))
+    """All steps of all sets in C; None without a compiler, then they are evaluated one by one."""
+    advance = _advance()
     sizes = {'ARGUMENTS': advance.sz_arg(), 'RESULTS': advance.sz_res(),
              'WORK': max(advance.sz_w(), 1), 'NUMBERS': len(STEP_TERMS)}
     source = '\n'.join([generated([advance]), *(
@@ -249,10 +228,10 @@ def _compiled() -> Callable | None:
     try:
         run = ctypes.CDLL(str(built('servo', source, EXACT))).servo_run
     except (RunError, OSError) as error:
-        logging.getLogger(__name__).info('servos move in numpy: %s', str(error).splitlines()[0])
+        logging.getLogger(__name__).info('servos move without C: %s', str(error).splitlines()[0])
         return None
     array = np.ctypeslib.ndpointer(float, flags='C_CONTIGUOUS')
-    run.restype, run.argtypes = None, [ctypes.c_long, ctypes.c_long, ctypes.c_double, *[array] * 5]
+    run.restype, run.argtypes = None, [ctypes.c_long, ctypes.c_long, ctypes.c_double, *[array] * 4]
     return run
 
 

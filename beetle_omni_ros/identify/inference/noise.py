@@ -1,0 +1,77 @@
+"""Coloured noise: a drift beside the fitted parameters."""
+
+from itertools import product
+
+import numpy as np
+
+JITTER = 1e-6       # relative increase of the variance, for series without noise
+LEVELS = 10.0 ** np.arange(0, 5)    # tried variances of a drift
+CORNERS = (0.5, 2.0, 8.0)           # tried
+
+
+class Drifting:
+    """
+    White noise of unit variance with a drift, in the slowest cosines of a recording.
+
+    The drift is slower than the motion, so that a zero has its noise and a gain has not.
+
+    Args:
+        count: samples of the recording.
+        slowest: cosines of the drift, beside the constant.
+        level: variance of the drift at frequency 0, over that of the white noise.
+        corner: half periods in the recording from which the variance falls, as of a process of
+            first order.
+
+    """
+
+    def __init__(self, count: int, slowest: int = 0, level: float = 0.0, corner: float = 1.0):
+        order = np.arange(slowest + 1)
+        variance = 1 + level / (1 + (order / corner)**2)
+        self._waves = np.cos(np.pi * order * (np.arange(count) + 0.5)[:, None] / count)
+        self._waves /= np.linalg.norm(self._waves, axis=0)
+        self._less = 1 - 1 / np.sqrt(variance)
+        self.log_determinant = float(np.log(variance).sum())
+
+    def whitened(self, series: np.ndarray) -> np.ndarray:
+        """Independent samples of unit variance from series (n, ...)."""
+        flat = series.reshape(len(series), -1)
+        return (flat - self._waves @ (self._less[:, None] * (self._waves.T @ flat))
+                ).reshape(series.shape)
+
+
+def drifting(residuals: list[np.ndarray], signals: list[np.ndarray], slowest: int
+             ) -> tuple[Drifting, np.ndarray]:
+    """
+    Noise with the most likely drift for the channels of a recording, besides fitted parameters.
+
+    A fit absorbs drift, as a zero does the mean. The likelihood is therefore that of data with
+    the prior variance of the fitted parameters (Harville 1977).
+
+    Args:
+        residuals: U residuals (n,) at the prior mean of the parameters.
+        signals: U derivatives (n, X) by parameters with standard normal priors.
+        slowest: cosines that are slower than the motion; 0: a drift is not observable.
+
+    Returns:
+        noise of all channels, and (U,) standard deviations of their white noise.
+
+    """
+    best: tuple = (-np.inf,)
+    for level, corner in [(0.0, 1.0), *product(LEVELS, CORNERS)][:None if slowest else 1]:
+        noise, value, scales = Drifting(len(residuals[0]), slowest, level, corner), 0.0, []
+        for residual, signal in zip(residuals, signals, strict=True):
+            white = noise.whitened(np.column_stack([residual, signal]))
+            r, a = white[:, 0], white[:, 1:]
+            own, score = a.T @ a, a.T @ r
+            variance = r @ r / len(r)
+            for _ in range(3):      # fixed point of the variance
+                h = own / variance + np.eye(a.shape[1])
+                solution = np.linalg.solve(h, score / variance)
+                rest = r - a @ solution
+                variance = rest @ rest / (len(r) - a.shape[1] + np.trace(np.linalg.inv(h)))
+            value -= (len(r) * np.log(variance) + noise.log_determinant
+                      + np.linalg.slogdet(h)[1] + (r @ r - score @ solution) / variance) / 2
+            scales.append(np.sqrt(variance))
+        if value > best[0]:
+            best = value, noise, np.array(scales)
+    return best[1], best[2]
