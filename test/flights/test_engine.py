@@ -88,7 +88,7 @@ def test_evidence_of_a_typical_size_is_the_mean_over_its_estimates():
     judge = Judge(found, np.array([0.001]), np.array([0.003]), np.array([[-np.inf, np.inf]]),
                   np.array([False]), np.zeros(1, dtype=int), 0.05, np.array([False]))
     slab = np.hypot(0.001, 0.003)
-    sigma = (judge.posterior((0,)).deviation[0]**-2 - slab**-2)**-0.5
+    sigma = judge._profile((0,))[2][0, 0]**0.5
     wide, null = np.hypot(sigma, slab), np.hypot(sigma, 0.001)
     mean = quad(lambda x: norm.pdf(x, 0, wide) * (norm.logpdf(x, 0, wide)
                                                   - norm.logpdf(x, 0, null)), -0.05, 0.05)[0]

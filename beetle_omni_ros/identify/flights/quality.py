@@ -87,10 +87,13 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
         for k, (start, free) in enumerate((
                 (less, own), (theta, own), (theta, every))):
             at = np.flatnonzero(free > 0)
-            left = h - g @ start
-            move = np.linalg.solve(g[at][:, at] + np.diag(free[at]**-2), left[at])
-            value = r2 - 2 * h @ start + start @ g @ start
-            total[k] += value - 2 * left[at] @ move + move @ g[at][:, at] @ move
+            left, info = h - g @ start, g[np.ix_(at, at)]
+            inner = np.linalg.inv(info + np.diag(free[at]**-2))
+            move = inner @ left[at]
+            total[k] += r2 - 2 * h @ start + start @ g @ start - 2 * left[at] @ move \
+                + move @ info @ move
+            # what a fit explains of white noise alone
+            total[k] += np.trace(inner @ info)
         count += each.size
     total = np.maximum(total, 1e-9 * count)
     # chi2 that is left of the difference, if the flights show a difference at all

@@ -89,7 +89,9 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
         partial=[] if verdict in NAMING else effects,
         candidates=candidates_of(solution, found), where=where_of(engine, solution),
         false_alarm_probability=chance_of(solution), held_out=held_out,
-        findings=[*findings, *varied(engine, solution)],
+        findings=[*findings, *varied(engine, solution), *(
+            test.sentence[:1].upper() + test.sentence[1:] for test in rest
+            if test.probability < engine.alpha / TESTS and verdict != 'unknown')],
         **numbers_of(engine, solution, [k for k, _ in found], judges))
 
 
@@ -331,12 +333,11 @@ def verdict_of(solution: Solution, sets: list[list[Entry]], rest: list[Unexplain
         alpha: accepted probability of a false alarm.
 
     """
-    if rest and rest[0].probability < alpha / TESTS and rest[0].gain > solution.gains.get(
-            solution.best, 0.0):
-        return 'unknown'
     if sets:
         crowd = max(len({entry.name for entry in members}) for members in sets)
         return 'not_decidable' if crowd >= CROWD else 'named_set' if crowd > 1 else 'named'
+    if rest and rest[0].probability < alpha / TESTS:
+        return 'unknown'
     return 'no_gap' if solution.e_value < log(1 / alpha) else 'not_decidable'
 
 
