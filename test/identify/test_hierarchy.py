@@ -269,16 +269,14 @@ class Bounded:
         return np.exp(-r @ r / 2) * np.prod(2 * norm.pdf(theta))
 
 
-@pytest.mark.parametrize('wanted', [-4.0, -1.0, 0.0, 0.3, 2.0])
-@pytest.mark.parametrize('sd', [0.1, 1.0])
+@pytest.mark.parametrize(('wanted', 'sd'), [
+    (-2.5, 1.0), (-1.0, 1.0), (0.0, 1.0), (2.0, 1.0), (-0.25, 0.1), (0.0, 0.1), (0.15, 0.1),
+    (2.0, 0.1)])
 def test_the_evidence_at_a_bound_is_that_of_quadrature(wanted, sd):
     problem = Bounded([wanted], sd)
-    if wanted / sd < -20:
-        pytest.skip('the loss is linear there')
     exact, _ = quad(problem.density, 0, 6, points=[max(wanted, 0.01)], epsabs=0, limit=200)
-    if abs(problem.root * wanted) < HUBER:
-        assert problem.fit().evidence == pytest.approx(np.log(exact), abs=1e-4)
-    assert problem.fit().theta[0, 0] >= 0
+    fit = problem.fit()
+    assert fit.evidence == pytest.approx(np.log(exact), abs=1e-4) and fit.theta[0, 0] >= 0
 
 
 @pytest.mark.parametrize('correlation', [0.0, 0.6, -0.6])

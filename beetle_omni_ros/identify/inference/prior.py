@@ -1,4 +1,4 @@
-"""Gaussian priors of fitted parameters."""
+"""Gaussian penalties of fitted parameters; without normaliser, so no densities for evidence."""
 
 from dataclasses import dataclass
 

@@ -28,8 +28,9 @@ def linear(x: np.ndarray, y: np.ndarray, passes: int = 8) -> np.ndarray:
     for _ in range(passes):
         fitted = np.linalg.lstsq(x * root[:, None], y * root, rcond=None)[0]
         residual = y - x @ fitted
-        root = np.sqrt(np.minimum(1, HUBER * scale_of(residual)
-                                  / np.maximum(np.abs(residual), 1e-12)))
+        white = residual / scale_of(residual)
+        own, ratio = huber(white)
+        root = np.sqrt(np.divide(own * ratio, white, out=np.ones(len(y)), where=white != 0))
     return fitted
 
 
