@@ -82,6 +82,20 @@ def test_evidence_of_one_key_agrees_with_quadrature(positive):
         np.log(integral(slab)) - np.log(integral(narrow[0])), abs=1e-3)
 
 
+def test_a_tolerance_with_limits_agrees_with_quadrature():
+    rng = np.random.default_rng(5)
+    found = normal([linear_flight(rng, np.array([0.0016]), keys=1)], ['a'], np.zeros(1))
+    narrow, low, high = 0.002, -0.002, 0.001
+    judge = Judge(found, np.array([narrow]), np.array([0.02]), np.array([[low, high]]),
+                  np.array([True]), np.zeros(1, dtype=int), 0.05, np.array([False]))
+    estimate, sigma = judge._profile((0,))[1][0], judge._profile((0,))[2][0, 0]**0.5
+    inside = quad(lambda x: norm.pdf(x, 0, narrow) * norm.pdf(estimate, x, sigma), low, high)[0] \
+        / (norm.cdf(high, 0, narrow) - norm.cdf(low, 0, narrow))
+    free = norm.pdf(estimate, 0, np.hypot(np.hypot(narrow, 0.02), sigma))
+    assert judge.gain((0,), ()) == pytest.approx(np.log(free / inside), abs=1e-3)
+    assert judge.posterior(()).theta[0] < high + 3 * sigma
+
+
 def test_evidence_of_a_typical_size_is_the_mean_over_its_estimates():
     rng = np.random.default_rng(4)
     found = normal([linear_flight(rng, np.zeros(1), keys=1)], ['a'], np.zeros(1))

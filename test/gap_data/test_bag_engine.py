@@ -1,5 +1,7 @@
 """Bags under the flight engine, flown by the independent simulator."""
 
+from dataclasses import replace
+
 from gap_data.cases import Case
 from gap_data.make import make_case
 import numpy as np
@@ -32,14 +34,28 @@ def test_feedback_of_gusts_in_a_smooth_task_is_no_effect(tmp_path):
     assert names(result) == [] and result['false_alarm_probability'] > 0.05
 
 
-def test_a_hidden_effect_is_named_with_its_size_and_explains_the_flight_that_judges(tmp_path):
-    made = flights(tmp_path, 6, ('rotor_drag', 0.6, 'plain'))
+def test_a_hidden_effect_is_named_though_the_sensors_differ_from_flight_to_flight(tmp_path):
+    rng, made = np.random.default_rng(1), flights(tmp_path, 6, ('rotor_drag', 0.6, 'plain'))
+    made = [replace(flight, pose_t=flight.pose_t + rng.uniform(-0.008, 0.008),
+                    joint_t=flight.joint_t + rng.uniform(-0.008, 0.008),
+                    imu=flight.imu + rng.normal(size=6) * np.repeat([0.05, 0.004], 3))
+            for flight in made]
     result = judged(made[:2], made[2:], ROBOT, P)
     assert result['verdict'] == 'named' and names(result) == ['rotor_drag']
     found = result['effects'][0]['parameters']['coefficient']
     assert found['interval'][0] < 0.6 < found['interval'][1]
     assert found['value'] == pytest.approx(0.6, rel=0.2)
     assert result['closure'] > 0.8
+    assert any('joint feedback delay differs' in finding for finding in result['findings'])
+
+
+def test_gains_loads_and_inertia_of_a_servo_have_one_common_factor(tmp_path):
+    keys = {**all_keys(ROBOT), **extra_keys()}
+    made = BagFlight(flights(tmp_path, 7)[0], ROBOT, BodyModel(ROBOT, keys, (0.0, 0.0)), keys, P)
+    made.modules = 1.0
+    factor = ['joint_bandwidth.kp', 'joint_bandwidth.kd', 'swing.ratio', 'modules.share']
+    slopes = made.linear({}, factor).slopes[:, 12:]
+    assert np.abs(slopes.sum(axis=2)).max() < 1e-3 * np.abs(slopes).max()
 
 
 def test_slopes_agree_with_differences_of_the_residual(tmp_path):

@@ -38,6 +38,7 @@ class Spectrum:
         floor: (C,) smallest standard deviation of a sample's noise.
         groups: indices of the channels with common noise.
         counts: number of frequencies that count, of each group.
+        step: between frequencies, the first of which is zero [Hz].
 
     """
 
@@ -48,6 +49,7 @@ class Spectrum:
     floor: np.ndarray
     groups: list[np.ndarray]
     counts: list[int]
+    step: float
     level: bool = False
     _kept: tuple | None = None
     _parts: list = field(default_factory=list)
@@ -190,7 +192,7 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
         noise[k] += np.diag((own**2).mean(axis=0))
     counts = [int((frequency[used] <= highest[channels[0]]).sum()) for channels in groups]
     return Spectrum(coefficients, derivatives, band, noise, floor, groups, counts,
-                    filters is not None)
+                    0.5 / (size * period), filters is not None)
 
 
 def _whitened(residual, slopes, mask, filters, warm):

@@ -23,7 +23,7 @@ from beetle_omni_ros.identify.flights.discrepancy import acting, LEAN
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.quality import left_of
 from beetle_omni_ros.identify.flights.solution import Solution
-from beetle_omni_ros.identify.flights.spectrum import blocks_of, Spectrum, spectrum
+from beetle_omni_ros.identify.flights.spectrum import Spectrum, spectrum
 
 WAVES = 12                                  # random features
 SIZES = (0.001, 0.003, 0.01, 0.03, 0.1)     # amplitudes relative to hover thrust and weight
@@ -56,10 +56,10 @@ class Unexplained:
     @property
     def sentence(self) -> str:
         """What was found, as the end of a sentence."""
-        where = f"in {' and '.join(name.replace('_', ' ') for name in self.channels)}"
-        what = f'a vibration of {self.frequency:.2g} Hz' if self.frequency else \
-            'something that depends on the motion and repeats'
-        return f'no known effect explains {what} {where} (probability {self.probability:.1g})'
+        what = f'a vibration of {self.frequency:.2g} Hz in ' + ' and '.join(
+            name.replace('_', ' ') for name in self.channels) if self.frequency else \
+            'a force or torque that depends on the motion and repeats'
+        return f'no known effect explains {what} (probability {self.probability:.1g})'
 
 
 def features(motion: dict[str, np.ndarray], time: np.ndarray) -> np.ndarray:
@@ -120,13 +120,12 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
                        float(np.sum(gains)), tuple(channels[c] for c in own))
 
 
-def line(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
-         channels: tuple[str, ...]) -> Unexplained:
+def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, ...]
+         ) -> Unexplained:
     """
     Test of a periodic force or torque.
 
     Args:
-        flights: with ``period``.
         spectra: of the flights.
         left: (B, F, C) whitened residual of each flight after the fit.
         channels: names of all channels.
@@ -134,8 +133,7 @@ def line(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
     """
     own = spectra[0].groups[0]
     count = min(rest.shape[1] for rest in left)
-    length = blocks_of(flights[0].mask, flights[0].period).shape[1] * flights[0].period
-    first = int(np.ceil(2 * length * SLOWEST))
+    first = int(np.ceil(SLOWEST / spectra[0].step))
     rest = np.concatenate([rest[:, first:count][..., own] for rest in left])**2
     blocks, power = len(rest), rest.mean(axis=0)
     ratio = np.ones_like(power)
@@ -146,7 +144,7 @@ def line(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
     sides = 2 * (NEAR - 1)
     chance = float(f_law.sf(ratio[k, c], blocks, blocks * sides)) * ratio.size
     order = np.argsort(-ratio[k])
-    frequency = (k + first) / (2 * length)
+    frequency = (k + first) * spectra[0].step
     return Unexplained('line', min(chance, 1.0), float(blocks * (
         ratio[k, c] - 1 - np.log(ratio[k, c])) / 2), tuple(channels[own[i]] for i in order[:2]),
         float(frequency))
@@ -163,5 +161,5 @@ def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
         return []
     left = left_of(engine, solution)
     rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
-            line(engine.flights, solution.spectra, left, engine.channels)]
+            line(solution.spectra, left, engine.channels)]
     return sorted(rows, key=lambda row: row.probability)
