@@ -283,7 +283,7 @@ class Engine:
             value = weight(chosen)
             if value > top:
                 best, top = chosen, value
-        visited = {best}        # pairwise gains need not be transitive
+        first, visited = best, {best}       # pairwise gains need not be transitive
         while True:
             near = {tuple(sorted(set(best) - out | more))
                     for out in [set(), *({k} for k in best)]
@@ -294,6 +294,8 @@ class Engine:
                 break
             best = chosen
             visited.add(best)
+        if self.gain(judge, first, best) > 0:
+            best = first
         weight(best)
         weight(tuple(k for k in best if self.entries[k].varying))
         posterior = judge.posterior(self.indices(best))
@@ -342,8 +344,8 @@ class Engine:
         """
         named = self.indices(solution.best)
         for k in solution.best:
-            if not self.entries[k].of_body:
-                continue        # no command reaches its channels
+            if not self.entries[k].in_loop:
+                continue
             split, keys, copies, count = self._split(solution.spectra, banned, k)
             size = np.maximum(self.typical[keys], np.abs(solution.theta[keys]))
             form = np.maximum(self.narrow[keys], FORM * np.abs(solution.theta[keys]))

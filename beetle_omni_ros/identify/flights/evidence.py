@@ -293,9 +293,8 @@ class Judge:
         if not len(c):
             return 0.0, estimate, wide
         value = _log_density(estimate, wide, prior)
-        informed = np.linalg.inv(wide)
-        total = np.linalg.inv(informed + np.diag(prior**-2))
-        mean = total @ (informed @ estimate)
+        share = prior[:, None]**2 * np.linalg.inv(wide + np.diag(prior**2))
+        total, mean = np.diag(prior**2) - share * prior**2, share @ estimate
         for k in np.flatnonzero(self.bounded[c] & ~(free & self.kept[c])):
             (low, high), size = self.bounds[c[k]], float(prior[k])
             deviation, middle = sqrt(total[k, k]), float(mean[k])

@@ -51,7 +51,7 @@ class Entry:
     name: str
     keys: tuple[str, ...]
     member: int | None = None
-    of_body: bool = True        # acts on forces and torques alone
+    in_loop: bool = True        # on channels with noise that a controller answers
     varying: bool = False       # differs from flight to flight, with keys for each flight
 
     @property
@@ -99,7 +99,8 @@ def entries_of(keys: dict[str, Key]) -> list[Entry]:
         effect = CATALOGUE[name]
         own = tuple(key for parameter in effect.numbers for key in names_of(name, parameter)
                     if key in keys)
-        body = effect.channels == 'B'
+        # noise of IMU and MoCap reaches the commands; servos are simulated from commands
+        body = effect.channels[:1] in 'BAW' and 'J' not in effect.channels
         result += [Entry(name, (key,), k + 1, body) for k, key in enumerate(own)] \
             if effect.each else [Entry(name, own, None, body)]
     return result

@@ -95,13 +95,12 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
     for flight, found, rest, kernels, x in zip(flights, spectra, left, filters, every,
                                                strict=True):
         effect = acting(flight.robot, flight.motion, x - mean, channels)
-        effect = effect.reshape(len(x), len(channels), -1)[:, own]
-        small = spectrum(np.zeros(effect.shape[:2]), effect, flight.mask[:, own], flight.period,
-                         found.floor[own], np.broadcast_to(flight.highest, len(channels))[own],
-                         [np.arange(len(own))], kernels[own])
+        effect = effect.reshape(len(x), len(channels), -1)
+        small = spectrum(np.zeros(effect.shape[:2]), effect, flight.mask, flight.period,
+                         found.floor, flight.highest, spectra[0].groups, kernels)
         count = found.counts[0]
         root = np.linalg.inv(np.linalg.cholesky(found.noise[-1][np.ix_(own, own)]))
-        a = (root @ small.slopes[:, :count]).reshape(len(rest), -1, effect.shape[2])
+        a = (root @ small.slopes[:, :count][:, :, own]).reshape(len(rest), -1, effect.shape[2])
         b = (rest[:, :count][..., own] @ root.T).reshape(len(rest), -1)
         info.append(a.transpose(0, 2, 1) @ a)
         score.append((a.transpose(0, 2, 1) @ b[..., None])[..., 0])
@@ -136,15 +135,16 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
     first = int(np.ceil(SLOWEST / spectra[0].step))
     rest = np.concatenate([rest[:, first:count][..., own] for rest in left])**2
     blocks, power = len(rest), rest.mean(axis=0)
-    ratio = np.ones_like(power)
-    for k in range(len(power)):
-        around = np.r_[max(k - NEAR, 0):max(k - 1, 0), k + 2:min(k + NEAR + 1, len(power))]
-        ratio[k] = power[k] / power[around].mean(axis=0)
+    # a slope of the spectrum is no line, so the larger of both sides counts
+    places = np.arange(NEAR, len(power) - NEAR)
+    ratio = np.array([power[k] / np.maximum(power[k - NEAR:k - 1].mean(axis=0),
+                                            power[k + 2:k + NEAR + 1].mean(axis=0))
+                      for k in places])
     k, c = np.unravel_index(ratio.argmax(), ratio.shape)
-    sides = 2 * (NEAR - 1)
+    sides = NEAR - 1
     chance = float(f_law.sf(ratio[k, c], blocks, blocks * sides)) * ratio.size
     order = np.argsort(-ratio[k])
-    frequency = (k + first) * spectra[0].step
+    frequency = (places[k] + first) * spectra[0].step
     return Unexplained('line', min(chance, 1.0), float(blocks * (
         ratio[k, c] - 1 - np.log(ratio[k, c])) / 2), tuple(channels[own[i]] for i in order[:2]),
         float(frequency))
