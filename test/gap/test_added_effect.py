@@ -5,13 +5,17 @@ from pathlib import Path
 import re
 
 from flights import model, Motion, P, ROBOT, solved
+from flown_once import FIVE_POSES
 import numpy as np
 import pytest
+from rich.console import Console
 from test_consumers import OUTPUTS, plain, with_effect
 from test_ingest import recording
 
+import beetle_omni_ros
 from beetle_omni_ros.identify.flights.priors import entries_of
 from beetle_omni_ros.identify.gap.body import BodyModel
+from beetle_omni_ros.identify.gap.command import gap_results
 from beetle_omni_ros.identify.gap.ingest import prepare
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
 from beetle_omni_ros.robot import effects
@@ -63,6 +67,19 @@ def test_the_gap_finder_identifies_the_added_effect(name, values, value):
     assert solved(made, [key], 'B', base=weak)[key] == pytest.approx(value, rel=1e-6)
     entry, = entries_of({n: own for n, own in keys.items() if own.effect == name and not own.form})
     assert entry.keys == (key,)
+
+
+def test_a_flight_with_the_added_effect_names_it_with_its_size(tmp_path):
+    hot = {HEAT: {'loss_per_kelvin': 0.004, 'temperature': 50.0}}
+    beetle_omni_ros.simulate('hover', FIVE_POSES, seed=3, bag=tmp_path / 'flight', plant=replace(
+        beetle_omni_ros.robot(), effects=hot))
+    file = tmp_path / 'no_loss.yaml'
+    file.write_text(f'extends: robot.yaml\neffects: {{{HEAT}: {{loss_per_kelvin: 0.0, '
+                    'temperature: 50.0}}\n')
+    result = gap_results([tmp_path / 'flight'], robot=file, console=Console(quiet=True))
+    assert [effect['names'] for effect in result['effects']] == [[HEAT]]
+    low, high = result['effects'][0]['parameters']['loss_per_kelvin']['interval']
+    assert low < 0.004 < high < 0.005
 
 
 @pytest.mark.parametrize('current', ['negative', 'positive', 'partly unknown'])
