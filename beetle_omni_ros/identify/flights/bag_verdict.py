@@ -74,6 +74,7 @@ def _choose_modules(models, every):
     for share in (0.0, 1.0):
         for model in models:
             model.modules = share
+            model.settle({})
         costs.append(min(sum(float(np.log(r.var(axis=0)).sum()) for model in models
                              for r in model.residual(late, 'BJ').values())
                          for late in ({}, *({'command_latency.delay': d} for d in LATE))))

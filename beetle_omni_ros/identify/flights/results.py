@@ -24,6 +24,7 @@ ALPHA = 0.05            # probability of a false alarm that is accepted
 CROWD = 4               # members of a set from which the flights do not decide
 NAMING = 'named', 'named_set'
 TESTS = 2               # of what is unexplained; they share the accepted probability
+FEEDBACK = 2            # entries that feedback may exclude; with more, the loop hides the robot
 LEAST_TIME = 1.0        # [s] in a regime, of which an RMS is stated
 Starts = dict[str, dict[str, float]]
 
@@ -333,6 +334,8 @@ def verdict_of(solution: Solution, sets: list[list[Entry]], rest: list[Unexplain
         alpha: accepted probability of a false alarm.
 
     """
+    if len(solution.banned) > FEEDBACK:
+        return 'not_decidable'
     if sets:
         crowd = max(len({entry.name for entry in members}) for members in sets)
         return 'not_decidable' if crowd >= CROWD else 'named_set' if crowd > 1 else 'named'
@@ -363,6 +366,10 @@ def reason_of(verdict: str, sets: list[list[Entry]], rest: list[Unexplained],
         return rest[0].sentence
     if verdict != 'not_decidable':
         return ''
+    if len(solution.banned) > FEEDBACK:
+        return ('the controller answers noise more than it flies: ' + ', '.join(sorted(
+            solution.entries[k].name.replace('_', ' ') for k in solution.banned))
+            + ' have other values at other frequencies')
     if sets:
         return 'they do not separate ' + ' and '.join(
             ' or '.join(dict.fromkeys(e.name.replace('_', ' ') for e in members))
