@@ -50,7 +50,7 @@ def stated(entry, deviation=0.0, half=0.1, starts=None):
     engine = SimpleNamespace(index={key: k for k, key in enumerate(entry.keys)},
                              typical=np.full(count, 0.3))
     posterior = SimpleNamespace(estimate=np.full(count, deviation),
-                                deviation=np.full(count, half / 1.96))
+                                covariance=np.eye(count) * (half / 1.96)**2)
     return parameters(entry, engine, list(range(count)), posterior, KEYS, starts or {})
 
 
