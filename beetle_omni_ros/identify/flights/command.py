@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import exp, log
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from beetle_omni_ros import __version__
+from beetle_omni_ros.identify.flights.balance import Balance, SLOW
 from beetle_omni_ros.identify.flights.engine import Engine, Solution
 from beetle_omni_ros.identify.flights.priors import entries_of, keys_of, spread
 from beetle_omni_ros.identify.flights.residual import COMPARED, GROUPS, TableFlight
@@ -36,6 +38,7 @@ TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coef
 EXPLAINED = 0.5         # share of the angular acceleration: below, errors exceed what is explained
 FEEDBACK = ('the commands explain less than half of the angular acceleration: a controller that '
             'feeds back what the model lacks would be taken for the robot')
+LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
 # Entries of the comparison of IMU and MoCap.
 SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
 
@@ -122,12 +125,15 @@ def _engine(flights, robot, declared, alpha, progress):
                  for key, prior in tolerances(GapParameters.load()).items()}
     spreads = {name: spread(robot, key, tolerance.get(name, 0.0), declared.clock_deviation)
                for name, key in keys.items()}
+    free = LAGS if 'specific_force' not in declared.signals else ()  # the lag of an estimator
+    spreads |= {name: replace(spreads[name], narrow=spreads[name].typical)
+                for name, key in keys.items() if key.effect in free}
+    entries = [entry for entry in entries_of(keys) if entry.name not in free]
     positive = frozenset(name for name, key in keys.items() if key.ends_at_none)
     # A mass is weighed, air is still and sensors have data sheets; maps of thrust differ by half.
     far = frozenset(name for name, key in keys.items() if key.effect not in (
         'mass', 'inertia', 'wind') and CATALOGUE[key.effect].layer not in ('sensor', 'timing'))
-    return Engine(flights, list(keys), spreads, entries_of(keys), positive, far, alpha,
-                  progress), keys
+    return Engine(flights, list(keys), spreads, entries, positive, far, alpha, progress), keys
 
 
 def _judged(flights, judging, robot, declared, alpha, progress):
@@ -158,24 +164,32 @@ def _judged(flights, judging, robot, declared, alpha, progress):
         engine, keys = _engine(usable, robot, declared, alpha, progress)
         solution = engine.run()
     progress('judging')
-    named = named_of(engine, solution, alpha)
-    sets = [[solution.entries[j] for j in members] for _, members in named]
-    error = exp(min(0.0, -solution.e_value))
+    tests: list[tuple] = [(engine, solution, keys)]
+    if slow := [part for f in usable if (part := f.balance(list(keys_of(robot, SLOW))))]:
+        groups['torque'] = {'used': True, 'channels': ['torque_x', 'torque_y'],
+                            'reason': 'no gyroscope: means of 2 s, by the attitude'}
+        tests.append(((balance := Balance(slow, robot)), balance, balance.keys))
+    e_value = float(np.logaddexp.reduce([s.e_value for _, s, _ in tests])) - log(len(tests))
+    found = [(e, s, own, k, members) for e, s, own in tests if e_value >= log(1 / alpha)
+             for k, members in named_of(e, s, alpha)]
+    sets = [[s.entries[j] for j in members] for _, s, _, _, members in found]
+    error = exp(min(0.0, -e_value))
     verdict = 'not_decidable'
-    null = 1 / (1 + exp(min(solution.e_value, 700.0)))     # both halves of the prior
-    if named:
+    if found:
         largest = max(map(len, sets))
         verdict = 'named' if largest == 1 else 'named_set' if largest < CROWD else 'not_decidable'
-    elif null >= 1 - alpha:
+    elif max(s.e_value for _, s, _ in tests) <= log(alpha / (1 - alpha)):   # halves of the prior
         verdict = 'no_gap'
-    effects = [effect_of(solution, engine, keys, k, members) for k, members in named]
-    gap = gaps_of(engine, solution, [k for k, _ in named],
+    effects = [effect_of(s, e, own, k, members) for e, s, own, k, members in found]
+    gap = gaps_of(engine, solution, [k for e, _, _, k, _ in found if e is engine],
                 [flight for flight in judging if flight.usable] or usable)
     unclear = [[entry.name for entry in members] for members in sets if len(members) > 1]
     return result_of(
         verdict, groups, effects=effects if verdict != 'not_decidable' else [],
         partial=effects if verdict == 'not_decidable' else [],
-        candidates=candidates_of(solution, named), where=where_of(engine, solution),
+        candidates=[row for _, s, _ in tests for row in candidates_of(s, [
+            (k, members) for _, of, _, k, members in found if of is s])],
+        where=where_of(engine, solution),
         false_alarm_probability=error, held_out=bool(judging), findings=findings, **gap,
         next_experiment=separating_experiment(unclear[0]) if unclear else None,
         summary=summary_of(verdict, sets, error, solution))
@@ -183,10 +197,9 @@ def _judged(flights, judging, robot, declared, alpha, progress):
 
 def result_of(verdict: str, groups: dict, summary: str, **more) -> dict:
     """Results that are written as JSON."""
-    base: dict = {'verdict': verdict, 'effects': [], 'partial': [], 'where': [], 'closure': None,
+    return {'verdict': verdict, 'effects': [], 'partial': [], 'where': [], 'closure': None,
             'gap_before': None, 'gap_after': None, 'noise_floor': None, 'candidates': [],
-            'next_experiment': None, 'groups': groups, 'summary': summary, 'findings': []}
-    return base | more
+            'next_experiment': None, 'groups': groups, 'summary': summary, 'findings': []} | more
 
 
 def _groups(flight, declared):
@@ -254,7 +267,8 @@ def effect_of(solution: Solution, engine: Engine, keys: dict[str, Key], k: int,
                 'file': base if len(own) > 1 else base[0]}
     gain = engine.gain(solution.judge, solution.best, tuple(sorted(set(solution.best) - {k})))
     names = list(dict.fromkeys(solution.entries[j].name for j in members))
-    result: dict = {'names': names, 'parameters': found, 'layer': CATALOGUE[entry.name].layer,
+    result: dict = {'names': names, 'members': [solution.entries[j].label for j in members],
+              'parameters': found, 'layer': CATALOGUE[entry.name].layer,
               'evidence': {'ln_bayes_factor': gain, 'delta_bic': 2 * gain,
                            'constancy': -solution.unsteady.get(k, 0.0)}}
     if entry.member is not None:
@@ -293,7 +307,7 @@ def gaps_of(engine: Engine, solution: Solution, named: list[int], flights: list)
 
 def summary_of(verdict: str, sets: list[list], error: float, solution: Solution) -> str:
     """The verdict as one sentence."""
-    names = ' and '.join(' or '.join(dict.fromkeys(e.name.replace('_', ' ') for e in members))
+    names = ' and '.join(' or '.join(dict.fromkeys(e.label.replace('_', ' ') for e in members))
                          for members in sets)
     chance = f'probability of a false alarm {error:.1g}' if error >= 1e-6 else \
         'probability of a false alarm below 1e-6'
