@@ -28,17 +28,15 @@ SCALES = (1.0, 3.0, 9.0)    # times typical: the prior of a candidate is a mixtu
 
 
 class Balance:
-    """Evidence of sets of entries; it stands for an engine and for its solution."""
+    """Evidence of single entries by (B, 2) means of each flight and their (B, 2, K) slopes."""
 
     def __init__(self, parts: Sequence[tuple[np.ndarray, np.ndarray]], robot: RobotParameters):
-        """Weigh all sets; a part has (B, 2) means of a flight and (B, 2, K) slopes by the keys."""
         # torques are linear in the scales of rotors, not in their logarithms
-        given = keys_of(robot, SLOW)
-        unit = np.array([key.base if key.relative else 1.0 for key in given.values()])
-        self.keys = {name: replace(key, relative=False) for name, key in given.items()}
+        self.keys = {n: replace(key, relative=False) for n, key in keys_of(robot, SLOW).items()}
         self.index = {name: k for k, name in enumerate(self.keys)}
         self._rotors, hub = (np.array([key.effect == name for key in self.keys.values()])
                              for name in ('rotor_thrust_coefficient', 'rotor_hub_moment'))
+        unit = np.where(self._rotors, [key.base for key in self.keys.values()], 1.0)
         self.entries = entries_of(keys_of(robot, SLOW - {'rotor_hub_moment'}))
         spreads = [spread(robot, key, 0.0, 0.0) for key in self.keys.values()]
         self.narrow, self.typical, flight = np.array(
@@ -58,12 +56,10 @@ class Balance:
         flat = robot.rotors.positions * [1, 1, 0]
         self._places = flat / np.linalg.norm(flat, axis=1, keepdims=True)
         self.judge, self.banned, self.unsteady = None, dict[int, float](), dict[int, float]()
-        none = self._posterior(()).gain
-        self.posteriors = {chosen: self._posterior(chosen, none)
-                           for chosen in [(), *((k,) for k in range(len(self.entries)))]}
+        none, singles = self._posterior(()).gain, [(k,) for k in range(len(self.entries))]
+        self.posteriors = {chosen: self._posterior(chosen, none) for chosen in ((), *singles)}
         self.best = max(self.posteriors, key=lambda chosen: self.posteriors[chosen].gain)
-        self.e_value = float(np.logaddexp.reduce(
-            [found.gain for chosen, found in self.posteriors.items() if chosen]))
+        self.e_value = float(np.logaddexp.reduce([self.posteriors[k].gain for k in singles]))
 
     def indices(self, chosen: Sequence[int]) -> list[int]:
         """Indices of the keys of some entries."""
@@ -95,6 +91,6 @@ class Balance:
         theta = weight @ mean
         deviation = np.sqrt(weight @ (square + (mean - theta)**2))
         # rotors, a load anywhere and a load below each rotor are equally likely
-        price = log(len(self.entries) + len(self._places)) if chosen else 0.0
-        gain = float(total - log(len(SCATTER) * len(SCALES)) - none - price)
-        return Posterior(gain, theta, theta[own], deviation[own])
+        count = len(self.entries) + len(self._places) if chosen else 1
+        total -= none + log(count * len(SCATTER) * len(SCALES))
+        return Posterior(float(total), theta, theta[own], deviation[own])
