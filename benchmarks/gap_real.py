@@ -1,24 +1,36 @@
 """
 `gap --format` on real flights: what it names, and whether disjoint halves agree.
 
-    .venv/bin/python benchmarks/gap_real.py FOLDER [--json FILE]
+    .venv/bin/python benchmarks/gap_real.py FOLDER [--crazypad] [--json FILE]
 
 FOLDER has the flights of NanoBench in the columns of `params/formats/nanobench.yaml`, and
 `labels.csv` with the columns file and vehicle. The flights of one build are divided into two
 halves, alternately by name. Cases: the model of the literature; without the effect of voltage; and
 the corrected model of the other half without each of its effects in turn.
+
+With `--crazypad`: the logs of the motors of CrazyPAD (`labels.csv` with cause and vehicle), single
+flights, all sets of two and three of one cause and vehicle, and single flights against files whose
+centre of mass is that of a normal flight of the same vehicle. `right`: every set of names holds
+the cause. A normal flight has none, and a load is a mass and moves the centre of mass.
 """
 
 import argparse
 import csv
+from itertools import combinations, groupby
 import json
 from pathlib import Path
 import tempfile
 
+import numpy as np
 from rich.console import Console
 import yaml
 
+from beetle_omni_ros.identify.flights.balance import Balance, SLOW
+from beetle_omni_ros.identify.flights.priors import keys_of
+from beetle_omni_ros.identify.flights.table import Format
+from beetle_omni_ros.identify.flights.table_verdict import load_tables
 from beetle_omni_ros.identify.gap.command import gap_results
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 
 BUILD = 'NanoBench-state-A'
@@ -51,12 +63,81 @@ def analysed(case, fitted, judging, robot, apply=None):
     return row
 
 
+def holding(cause):
+    """Labels of entries that may stand for a cause of CrazyPAD: M3 is rotor 3."""
+    rotors = {f'rotor_thrust_coefficient[{word[1]}]' for word in cause.split('_')
+              if word[:1] == 'M' and word[1:].isdigit()}
+    if cause.startswith('cut'):
+        return rotors
+    return rotors | {'mass', 'centre_of_mass'} if 'weight' in cause else set()
+
+
+def crazypad(folder):
+    """One row for each set of flights: cause, names, and whether they hold the cause."""
+    with open(folder / 'labels.csv', newline='', encoding='utf-8') as file:
+        flights = sorted((row['vehicle'], row['cause'], folder / row['file'])
+                         for row in csv.DictReader(file) if row['file'].startswith('pad_motor'))
+    rows = []
+    with tempfile.TemporaryDirectory() as temporary:
+        robots = {'': ROBOT}
+        for vehicle, cause, path in flights:
+            if cause == 'normal_flight':
+                robots[f'{vehicle} {path.name}'] = centred(path, Path(temporary, path.stem))
+        for (vehicle, cause), group in groupby(flights, key=lambda flight: flight[:2]):
+            paths = [path for *_, path in group]
+            sets = [(chosen, '') for size in (1, 2, 3) for chosen in combinations(paths, size)]
+            sets += [((path,), name) for path in paths for name in robots if name.startswith(
+                vehicle) and not name.endswith(path.name)]
+            for chosen, name in sets:
+                rows.append(weighed(vehicle, cause, chosen, robots[name], name))
+    return rows
+
+
+def centred(path, to):
+    """Robot file with the centre of mass that balances a flight."""
+    robot = RobotParameters.load(ROBOT)
+    flight, = load_tables([path], robot, Format.load('crazypad_motor'))
+    found = Balance([flight.balance(list(keys_of(robot, SLOW)))], robot)
+    own = [found.index[name] for name in ('centre_of_mass.offset[0]', 'centre_of_mass.offset[1]',
+                                          'rotor_hub_moment.coefficient')]
+    x, y, _ = np.linalg.solve(found.info[np.ix_(own, own)], found.right[own]).tolist()
+    to = to.with_suffix('.yaml')
+    to.write_text(f'extends: {ROBOT}\neffects:\n  voltage_sag: {{exponent: 1.0}}\n'
+                  f'  centre_of_mass: {{offset: [{x}, {y}, 0.0]}}\n')
+    return to
+
+
+def weighed(vehicle, cause, paths, robot, reference):
+    """One row of the table of CrazyPAD."""
+    result = gap_results(paths, [], robot, form='crazypad_motor', console=Console(quiet=True))
+    effects, right = result['effects'], holding(cause)
+    score = 'undecided' if not effects else 'right' if all(
+        set(effect['members']) & right for effect in effects) else 'wrong'
+    sizes = ['/'.join(e['members']) + ' ' + ', '.join(
+        f"{p['value']:.2f} [{p['interval'][0]:.2f}, {p['interval'][1]:.2f}]"
+        for p in e['parameters'].values() if not isinstance(p['value'], list)) for e in effects]
+    row = {'vehicle': vehicle, 'cause': cause, 'flights': [path.name for path in paths],
+           'reference': reference, 'verdict': result['verdict'], 'effects': effects,
+           'false_alarm_probability': result['false_alarm_probability'], 'score': score}
+    print(f"| {cause} {vehicle[-2:]} | {len(paths)} | {reference} | {row['verdict']} | "
+          f"{'; '.join(sizes)} | {row['false_alarm_probability']:.2g} | {score} |", flush=True)
+    return row
+
+
 def main():
     """Run all cases and print a row for each."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0])
     parser.add_argument('folder', type=Path)
     parser.add_argument('--json', type=Path)
+    parser.add_argument('--crazypad', action='store_true')
     given = parser.parse_args()
+    if given.crazypad:
+        print('| cause | flights | reference | verdict | effects, 95 % | probability | |')
+        print('| --- | --- | --- | --- | --- | --- | --- |')
+        rows = crazypad(given.folder)
+        if given.json:
+            given.json.write_text(json.dumps(rows, indent=1))
+        return
     one, two = halves(given.folder)
     print('| case | verdict | effects, 95 % | gap before | after |')
     print('| --- | --- | --- | --- | --- |')

@@ -11,7 +11,6 @@ from scipy.stats import norm
 
 from beetle_omni_ros.identify.flights.evidence import Judge, normal
 from beetle_omni_ros.identify.flights.motion import turning, wander
-from beetle_omni_ros.identify.flights.results import expected
 from beetle_omni_ros.identify.flights.spectrum import EDGES, spectrum
 from beetle_omni_ros.identify.flights.table import Format, read_flight
 from beetle_omni_ros.identify.flights.table_verdict import load_tables
@@ -106,7 +105,7 @@ def test_evidence_of_a_typical_size_is_the_mean_over_its_estimates():
     wide, null = np.hypot(sigma, slab), np.hypot(sigma, 0.001)
     mean = quad(lambda x: norm.pdf(x, 0, wide) * (norm.logpdf(x, 0, wide)
                                                   - norm.logpdf(x, 0, null)), -0.05, 0.05)[0]
-    assert expected(judge, [0]) == pytest.approx(mean, rel=1e-4) and mean > 0.1
+    assert judge.expected([0]) == pytest.approx(mean, rel=1e-4) and mean > 0.1
 
 
 def test_noise_of_a_flexible_fit_is_not_too_small():

@@ -47,6 +47,17 @@ def test_members_of_a_set_have_sizes_and_an_experiment_separates_them():
     assert 'or thrust_coefficient' in cells and '0.91' in cells
 
 
+def test_members_are_told_with_the_numbers_of_their_rotors():
+    scale = {'value': 0.7, 'interval': [0.63, 0.77], 'unit': '1', 'file': 1.0, 'typical': 0.05}
+    members = ['rotor_thrust_coefficient[3]', 'rotor_thrust_coefficient[1]']
+    result = result_of('named_set', GROUPS, effects=[{
+        'names': ['rotor_thrust_coefficient'], 'members': members, 'rotor': 3,
+        'parameters': {'scale': scale}, 'evidence': {'delta_bic': 20.0}}])
+    assert headline(result) == f'one of a set: {members[0]} or {members[1]}'
+    assert result['summary'].startswith(
+        'Rotor thrust coefficient[3] or rotor thrust coefficient[1] of 0.7 +- 0.07')
+
+
 def test_flights_that_show_less_than_half_of_the_catalogue_decide_nothing():
     some = [candidate(name) for name in ('mass', 'wind', 'rotor_drag')]
     shown = result_of('no_gap', GROUPS, candidates=some, hidden=['mass'])

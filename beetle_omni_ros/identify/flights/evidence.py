@@ -226,6 +226,21 @@ class Judge:
                 np.unique(self.owner[c[free & self.far[c]]])))
         return float(total)
 
+    def expected(self, index: list[int]) -> float:
+        """
+        Mean ln of the evidence that keys would have, if they had their typical size [nat].
+
+        With the covariance C of the estimate, and the variances N of the narrow and S of the wide
+        prior, the estimate would scatter by C + S about the robot file, so that the mean of its
+        log density ratio is the divergence of both normal densities.
+        """
+        c, _, wide, _, _ = self._profile(tuple(sorted(index)))
+        free = np.isin(c, index)
+        null = wide + np.diag(self.narrow[c]**2)
+        ratio = np.linalg.solve(null, null + np.diag(free * self.typical[c]**2))
+        return float(0.5 * (np.trace(ratio) - len(c) - np.linalg.slogdet(ratio)[1])
+                     - log(3) * self.far[c[free]].any())
+
     def _profile(self, index):
         """Keys, estimate and its covariance, change of all keys by them, prior deviations."""
         if index in self._profiles:

@@ -88,16 +88,15 @@ def rising(values, period):
     """Derivatives (N, 3) of smoothed values."""
     width = max(int(round(SMOOTH / period)), 1)
     padded = np.pad(values, ((width, width), (0, 0)), mode='edge')
-    kernel = np.ones(width) / width
-    smooth = np.stack([np.convolve(c, kernel, 'same') for c in padded.T], axis=1)
+    smooth = np.stack([np.convolve(c, np.ones(width) / width, 'same') for c in padded.T], axis=1)
     return np.gradient(smooth, period, axis=0)[width:-width]
 
 
 def turning(quaternion, period):
     """Body rates (N, 3) of quaternions (N, 4)."""
     turned = Rotation.from_quat(quaternion)
-    rates = (turned[:-2].inv() * turned[2:]).as_rotvec() / (2 * period)
-    return np.concatenate([rates[:1], rates, rates[-1:]])
+    return np.pad((turned[:-2].inv() * turned[2:]).as_rotvec() / (2 * period), ((1, 1), (0, 0)),
+                  mode='edge')
 
 
 def filled(values, period):

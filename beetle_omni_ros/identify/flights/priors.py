@@ -19,8 +19,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 # Typical and smallest deviations of the catalogue are those of a robot of this size.
 WEIGHT, ARM = 29.8, 0.2754      # [N], [m] params/robot.yaml
 # Power of weight and of arm by which a deviation of a unit grows with the size of a robot.
-SIZE = {'N': (1, 0), 'N s/m': (1, 0), 'N s^2/m^2': (1, 0), 'N m': (1, 1), 'N m s': (1, 1),
-        'm': (0, 1), 'kg m': (1, 1), 'kg m^2': (1, 2)}
+SIZE = {'N': (1, 0), 'N s/m': (1, 0), 'N s^2/m^2': (1, 0), 'N m': (1, 1), 'N s': (1, 1),
+        'N m s': (1, 1), 'm': (0, 1), 'kg m': (1, 1), 'kg m^2': (1, 2)}
 # Standard deviations between the flights of one vehicle, by key.
 FLIGHT = {'thrust_coefficient.scale': 0.017, 'rotor_thrust_coefficient.scale': 0.01,
           'imu_accelerometer_bias.bias': 0.05,
@@ -86,9 +86,8 @@ def spread(robot: RobotParameters, key: Key, tolerance: float, stamps: float) ->
             np.linalg.norm(robot.rotors.positions[:, :2], axis=1).mean())
     if plain == 'rotor_dead_time.delay':
         flight = max(flight, stamps)
-    typical = key.typical
-    if plain == 'wind.force':
-        typical = AIR * CATALOGUE['rotor_drag'].parameters['coefficient'].typical
+    typical = AIR * CATALOGUE['rotor_drag'].parameters['coefficient'].typical if (
+        plain == 'wind.force') else key.typical
     return Spread(tolerance or 0.5 * key.smallest * size, typical * size, flight)
 
 

@@ -39,6 +39,7 @@ AIRBORNE = 0.15         # [m] above the first position, one rotor diameter: no c
 MEMORY = 2.0            # rotor time constants after which a lost command is forgotten
 FULL = 0.995            # share of full duty from which a command is saturated
 PHASE = 0.1             # [rad] error by wrong stamps up to which a frequency counts
+HELD = 2.0              # [s] blocks of the balance of torques, so below 0.25 Hz
 SLOWEST = 0.25          # [Hz] clocks that do not agree up to here are not compared
 # Signal -> what the comparison of MoCap and IMU lacks without it.
 NEEDED = {'position': 'position', 'quaternion': 'quaternion', 'specific_force': 'accelerometer',
@@ -99,8 +100,8 @@ class TableFlight:
         self.reasons = dict(zip(CHANNELS, reasons, strict=True))
         self._measured = measured[:, chosen]
         self._chosen = chosen
-        flying = self._flying()
-        self.mask = np.isfinite(self._measured) & (known & flying)[:, None]
+        self._airborne = known & self._flying()
+        self.mask = np.isfinite(self._measured) & self._airborne[:, None]
         self._measured = np.nan_to_num(self._measured)
 
     @property
@@ -117,10 +118,8 @@ class TableFlight:
         command, known = filled(values[name], self.period)
         if name == 'duty':
             known &= values[name].max(axis=1, initial=0, where=np.isfinite(values[name])) < FULL
-            volts, _ = filled(values['voltage'], self.period) if 'voltage' in values else (
-                None, None)
-            self._volts = np.full(len(command), self._motor.nominal_voltage) if volts is None \
-                else volts[:, 0]
+            self._volts = filled(values['voltage'], self.period)[0][:, 0] if (
+                'voltage' in values) else np.full(len(command), self._motor.nominal_voltage)
         past = int(round(MEMORY * self.robot.rotors.time_constant / self.period))
         lost = np.convolve(~known, np.ones(past + 1))[:len(known)] > 0
         return command, ~lost
@@ -193,14 +192,11 @@ class TableFlight:
     def _flying(self):
         """(N,) whether the robot is in the air."""
         position = self._inputs['position']
-        high = np.ones(len(position), dtype=bool)
-        if 'position' in self.table.values:
-            high = position[:, 2] > position[:10, 2].mean() + AIRBORNE
+        high = 'position' not in self.table.values or (
+            position[:, 2] > position[:10, 2].mean() + AIRBORNE)
         lifted = self._thrust({})[0].sum(axis=1) > 0.5 * self.robot.mass * self.robot.gravity
-        flying = high & lifted
         edge = int(round(0.5 / self.period))    # half a second of transients at both ends
-        inside = np.convolve(~flying, np.ones(2 * edge + 1), 'same') == 0
-        return inside
+        return np.convolve(~(high & lifted), np.ones(2 * edge + 1), 'same') == 0
 
     def _thrust(self, theta):
         """Thrusts after delay and lag (N, 4) [N] and their rates."""
@@ -231,9 +227,7 @@ class TableFlight:
     def without(self, groups: tuple[str, ...], reason: str) -> None:
         """Leave groups of channels out, for this ``reason``."""
         keep = [k for k, name in enumerate(self.channels) if not name.startswith(groups)]
-        for name in self.channels:
-            if name.startswith(groups):
-                self.reasons[name] = reason
+        self.reasons |= {name: reason for name in self.channels if name.startswith(groups)}
         self.mask, self._measured = self.mask[:, keep], self._measured[:, keep]
         self._chosen = [self._chosen[k] for k in keep]
         self.channels = tuple(self.channels[k] for k in keep)
@@ -268,19 +262,38 @@ class TableFlight:
         outside = {'voltage_sag.exponent'} if 'duty' in self.table.values else set()
         exact = [name for name in names if self.keys[name].body and name not in outside]
         if exact:
-            own = self.body.derivatives(inputs, body_theta, tuple(exact))
-            for k, name in enumerate(exact):
-                slopes[:, :6, names.index(name)] = -own[:, :, k]
+            slopes[:, :6, [names.index(name) for name in exact]] = -self.body.derivatives(
+                inputs, body_theta, tuple(exact))
         for k, name in enumerate(names):
             if name in exact:
                 continue
-            step, both = self.keys[name].step, self.keys[name].parameter == 'delay'
-            step = 0.5 * self.period if both else step
+            key = self.keys[name]
+            step = 0.5 * self.period if key.parameter == 'delay' else key.step
             ahead = {**theta, name: theta.get(name, 0.0) + step}
             behind = {**theta, name: theta.get(name, 0.0) - step}
             slopes[:, :, k] = -(self._full(ahead) - self._full(behind)) / (2 * step)
         return Linear(self._measured - now[:, self._chosen], slopes[:, self._chosen],
                       self._measured)
+
+    def balance(self, names: list[str]) -> tuple[np.ndarray, np.ndarray] | None:
+        """
+        Means of B blocks of roll and pitch accelerations by the attitude [rad/s^2].
+
+        They are (B, 2) less the expected ones, and (B, 2, K) slopes of these; None if not shown.
+        """
+        there, rows = set(self.table.values), np.flatnonzero(self._airborne)
+        parts = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+        blocks = [block for part in parts if (count := round(len(part) * self.period / HELD))
+                  for block in np.array_split(part, count)]
+        if 'angular_velocity' in there or len(blocks) < 2 or not (
+                there & {'quaternion', 'acceleration'} and there & {'position', 'velocity'}):
+            return None
+        turned = rising(turning(self._inputs['quaternion'], self.period), self.period)
+        inputs, at = self._at({})
+        left = turned - self.body(inputs, at)[:, 3:]
+        slopes = self.body.derivatives(inputs, at, tuple(names))
+        return (np.array([left[block, :2].mean(axis=0) for block in blocks]),
+                np.array([slopes[block, 3:5].mean(axis=0) for block in blocks]))
 
     @property
     def motion(self) -> dict[str, np.ndarray]:

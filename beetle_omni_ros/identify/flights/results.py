@@ -9,8 +9,9 @@ from math import exp, log
 import numpy as np
 
 from beetle_omni_ros import __version__
+from beetle_omni_ros.identify.flights.balance import Balance
 from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.evidence import Judge, Posterior
+from beetle_omni_ros.identify.flights.evidence import Posterior
 from beetle_omni_ros.identify.flights.priors import Entry
 from beetle_omni_ros.identify.flights.quality import disagreement, errors
 from beetle_omni_ros.identify.flights.solution import log_prior, Solution
@@ -64,7 +65,7 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
 
 def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: list,
               groups: dict, held_out: bool, starts: Starts | None = None,
-              findings: Sequence[str] = ()) -> dict:
+              findings: Sequence[str] = (), slow: Balance | None = None) -> dict:
     """
     Results of a solution.
 
@@ -77,23 +78,33 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
         held_out: whether the judges are other flights than the fitted ones.
         starts: as of :class:`~beetle_omni_ros.identify.flights.bag.BagFlight`.
         findings: sentences about the flights.
+        slow: balance of torques; the mean of both e-values is one.
 
     """
-    found = named_of(engine, solution, engine.alpha)
-    sets = [[solution.entries[j] for j in members] for _, members in found]
+    alpha = engine.alpha
+    tests: list[tuple] = [(engine, solution, keys), *([(slow, slow, slow.keys)] if slow else [])]
+    e_value = float(np.logaddexp.reduce([s.e_value for _, s, _ in tests])) - log(len(tests))
+    chance = exp(min(0.0, -e_value))
+    found = [(e, s, own, k, members) for e, s, own in tests if chance <= alpha
+             for k, members in named_of(e, s, alpha)]
+    taken = [[k for e, _, _, k, _ in found if e is test[0]] for test in tests]
+    sets = [list(dict.fromkeys(s.entries[j].label if e is slow else s.entries[j].name
+                               for j in members)) for e, s, _, _, members in found]
     rest = unexplained(engine, solution)
-    verdict = verdict_of(solution, sets, rest, engine.alpha)
-    effects = [effect_of(solution, engine, keys, k, members, starts) for k, members in found]
+    verdict = verdict_of(chance, sets, rest, alpha)
+    effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]
     return result_of(
-        verdict, groups, reason_of(verdict, sets, rest, solution),
+        verdict, groups, reason_of(verdict, sets, rest, chance),
         effects=effects if verdict in NAMING else [],
         partial=[] if verdict in NAMING else effects,
-        candidates=candidates_of(solution, found), where=where_of(engine, solution),
-        false_alarm_probability=chance_of(solution), held_out=held_out,
-        findings=[*findings, *varied(engine, solution), *(
+        candidates=sorted((row for (_, s, _), own in zip(tests, taken, strict=True)
+                           for row in candidates_of(s, own)), key=_rank, reverse=True),
+        hidden=[name for _, s, _ in tests for name in hidden_of(s, alpha / len(tests))],
+        where=where_of(engine, solution), false_alarm_probability=chance,
+        held_out=held_out, findings=[*findings, *varied(engine, solution), *(
             test.sentence[:1].upper() + test.sentence[1:] for test in rest
-            if test.probability < engine.alpha / TESTS and verdict != 'unknown')],
-        **numbers_of(engine, solution, [k for k, _ in found], judges))
+            if test.probability < alpha / TESTS and verdict != 'unknown')],
+        **numbers_of(engine, solution, taken[0], judges))
 
 
 def named_of(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int, list[int]]]:
@@ -103,8 +114,6 @@ def named_of(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int
     An entry is needed if the set without it is less probable by ``alpha``. Its rivals are the
     entries whose set in its place is more probable than ``alpha`` of the best one.
     """
-    if solution.e_value < log(1 / alpha):
-        return []
     best, gain = solution.best, engine.gain
     named = []
     for k in best:
@@ -137,6 +146,7 @@ def effect_of(solution: Solution, engine: Engine, keys: dict[str, Key], k: int,
 
     result: dict = {
         'names': list(dict.fromkeys(solution.entries[j].name for j in members)),
+        'members': list(dict.fromkeys(solution.entries[j].label for j in members)),
         'parameters': sizes(k), 'layer': CATALOGUE[entry.name].layer, **_member(entry),
         'evidence': {'ln_bayes_factor': gain, 'delta_bic': 2 * gain,
                      'constancy': -solution.unsteady.get(k, 0.0)}}
@@ -194,30 +204,13 @@ def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Poster
     return found
 
 
-def expected(judge: Judge, index: list[int]) -> float:
-    """
-    Mean ln of the evidence that a set of keys would have, if they had their typical size [nat].
-
-    With the covariance C of the estimate, and the variances N of the narrow and S of the wide
-    prior, the estimate would scatter by C + S about the robot file, so that the mean of its log
-    density ratio is the divergence of both normal densities.
-    """
-    c, _, wide, _, _ = judge._profile(tuple(sorted(index)))
-    free = np.isin(c, index)
-    null = wide + np.diag(judge.narrow[c]**2)
-    ratio = np.linalg.solve(null, null + np.diag(free * judge.typical[c]**2))
-    return float(0.5 * (np.trace(ratio) - len(c) - np.linalg.slogdet(ratio)[1])
-                 - log(3) * judge.far[c[free]].any())
-
-
-def candidates_of(solution: Solution, named: list[tuple[int, list[int]]]) -> list[dict]:
+def candidates_of(solution: Solution, taken: Sequence[int]) -> list[dict]:
     """
     Evidence of each entry alone, the largest first.
 
     Of the starts of one entry, the one with most evidence counts. ``expected_ln_bayes_factor`` is
     the evidence that a typical size would have in these flights.
     """
-    taken = {k for k, _ in named}
     rows: dict[tuple, dict] = {}
     for k, entry in enumerate(solution.entries):
         if entry.varying:
@@ -228,7 +221,7 @@ def candidates_of(solution: Solution, named: list[tuple[int, list[int]]]) -> lis
                'reason': 'value differs between frequencies' if k in solution.banned else '',
                'evidence': {'ln_bayes_factor': gain,
                             'delta_bic': None if gain is None else 2 * gain},
-               'expected_ln_bayes_factor': expected(solution.judge, index)}
+               'expected_ln_bayes_factor': solution.judge.expected(index)}
         other = rows.get((entry.name, entry.member))
         if other is None or _rank(row) > _rank(other):
             rows[entry.name, entry.member] = row
@@ -304,31 +297,24 @@ def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: li
     """
     Errors over the noise floor without and with the named effects, closure, and what was fitted.
 
-    ``tolerances`` are the deviations of keys that are not named; ``hidden``: see
-    :func:`hidden_of`.
+    ``tolerances`` are the deviations of keys that are not named.
     """
     before, after, floor, closure = errors(engine, solution, named, flights)
     keys, own = engine.flights[0].keys, set(engine.indices(named))
+    tolerances = {name: {'deviation': float(solution.theta[k]), 'relative': keys[name].relative}
+                  for k, name in enumerate(engine.names[:engine.known])
+                  if name in keys and k not in own}
     return {'gap_before': before / floor, 'gap_after': after / floor, 'noise_floor': 1.0,
-            'closure': closure, 'hidden': hidden_of(solution, engine.alpha),
-            'tolerances': {name: {'deviation': float(solution.theta[k]),
-                                  'relative': keys[name].relative}
-                           for k, name in enumerate(engine.names[:engine.known])
-                           if name in keys and k not in own}}
+            'closure': closure, 'tolerances': tolerances}
 
 
-def chance_of(solution: Solution) -> float:
-    """Probability that a set of effects has as much evidence without any effect."""
-    return exp(min(0.0, -solution.e_value))
-
-
-def verdict_of(solution: Solution, sets: list[list[Entry]], rest: list[Unexplained],
-               alpha: float) -> str:
+def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained], alpha: float
+               ) -> str:
     """
     Verdict on flights.
 
     Args:
-        solution: of the engine.
+        chance: probability of as much evidence without any effect.
         sets: named entries, each with those that could stand in its place.
         rest: tests of what no entry explains, the most improbable first.
         alpha: accepted probability of a false alarm.
@@ -337,11 +323,11 @@ def verdict_of(solution: Solution, sets: list[list[Entry]], rest: list[Unexplain
     if len(solution.banned) > FEEDBACK:
         return 'not_decidable'
     if sets:
-        crowd = max(len({entry.name for entry in members}) for members in sets)
+        crowd = max(map(len, sets))
         return 'not_decidable' if crowd >= CROWD else 'named_set' if crowd > 1 else 'named'
     if rest and rest[0].probability < alpha / TESTS:
         return 'unknown'
-    return 'no_gap' if solution.e_value < log(1 / alpha) else 'not_decidable'
+    return 'no_gap' if chance > alpha else 'not_decidable'
 
 
 def varied(engine: Engine, solution: Solution) -> list[str]:
@@ -359,8 +345,8 @@ def varied(engine: Engine, solution: Solution) -> list[str]:
     return found
 
 
-def reason_of(verdict: str, sets: list[list[Entry]], rest: list[Unexplained],
-              solution: Solution) -> str:
+def reason_of(verdict: str, sets: list[list[str]], rest: list[Unexplained], chance: float
+              ) -> str:
     """Why a verdict without names was reached, as the end of a sentence."""
     if verdict == 'unknown':
         return rest[0].sentence
@@ -371,8 +357,6 @@ def reason_of(verdict: str, sets: list[list[Entry]], rest: list[Unexplained],
             solution.entries[k].name.replace('_', ' ') for k in solution.banned))
             + ' have other values at other frequencies')
     if sets:
-        return 'they do not separate ' + ' and '.join(
-            ' or '.join(dict.fromkeys(e.name.replace('_', ' ') for e in members))
-            for members in sets)
+        return f"they do not separate {' and '.join(map(' or '.join, sets))}".replace('_', ' ')
     return ('an effect is more likely than none, but a false alarm would have the probability '
-            f'{chance_of(solution):.2g}')
+            f'{chance:.2g}')

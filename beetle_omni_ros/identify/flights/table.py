@@ -187,9 +187,8 @@ def read_flight(path: Path, form: Format) -> Table:
         raise LogError(f'{path}: cannot be read ({getattr(error, "strerror", None) or error})') \
             from None
     header = [name.strip() for name in rows[0]] if rows else []
-    wanted = {name: [column for column in signal.columns if column is not None]
-              for name, signal in form.signals.items()}
-    absent = [column for columns in wanted.values() for column in columns if column not in header]
+    absent = [column for signal in form.signals.values() for column in signal.columns
+              if column is not None and column not in header]
     if absent:
         raise LogError(f'{path}: no column {absent[0]!r}, which the format {form.name} declares; '
                        f"found {quoted(', '.join(header))}")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from beetle_omni_ros.identify.flights.balance import Balance, SLOW
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.priors import entries_of, keys_of, spread
 from beetle_omni_ros.identify.flights.quality import explained
@@ -29,6 +31,7 @@ TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coef
 EXPLAINED = 0.5         # share of the angular acceleration: below, errors exceed what is explained
 FEEDBACK = ('the commands explain less than half of the angular acceleration: a controller that '
             'feeds back what the model lacks would be taken for the robot')
+LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
 # Entries of the comparison of IMU and MoCap.
 SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
 
@@ -53,12 +56,15 @@ def _engine(flights, robot, p, declared, alpha, progress):
                  for key, prior in tolerances(p).items()}
     spreads = {name: spread(robot, key, tolerance.get(name, 0.0), declared.clock_deviation)
                for name, key in keys.items()}
+    free = LAGS if 'specific_force' not in declared.signals else ()  # the lag of an estimator
+    spreads |= {name: replace(spreads[name], narrow=spreads[name].typical)
+                for name, key in keys.items() if key.effect in free}
+    entries = [entry for entry in entries_of(keys) if entry.name not in free]
     bounds = {name: (0.0, np.inf) for name, key in keys.items() if key.ends_at_none}
     # A mass is weighed, air is still and sensors have data sheets; maps of thrust differ by half.
     far = frozenset(name for name, key in keys.items() if key.effect not in (
         'mass', 'inertia', 'wind') and CATALOGUE[key.effect].layer not in ('sensor', 'timing'))
-    return Engine(flights, list(keys), spreads, entries_of(keys), bounds, far, alpha,
-                  progress), keys
+    return Engine(flights, list(keys), spreads, entries, bounds, far, alpha, progress), keys
 
 
 def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
@@ -115,8 +121,12 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
         solution = engine.run()
     progress('judging')
     judges = [flight for flight in judging if flight.usable] or usable
+    slow = [part for f in usable if (part := f.balance(list(keys_of(robot, SLOW))))]
+    if slow:
+        groups['torque'] = {'used': True, 'channels': ['torque_x', 'torque_y'],
+                            'reason': 'no gyroscope: means of 2 s, by the attitude'}
     return concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
-                     findings=findings)
+                     findings=findings, slow=Balance(slow, robot) if slow else None)
 
 
 def _groups(flight, declared):

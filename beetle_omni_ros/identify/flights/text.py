@@ -25,6 +25,8 @@ def headline(result: dict) -> str:
 
 def label(effect: dict) -> str:
     """Names of an effect or candidate with the number of its rotor or joint."""
+    if len(effect.get('members', [])) > 1:
+        return ' or '.join(effect['members'])
     member = effect.get('rotor') or effect.get('joint')
     names = ' or '.join(effect.get('names') or [effect['name']])
     return names + (f' {member}' if member else '')
@@ -74,9 +76,10 @@ def _spelled(name):
 
 
 def _effect_text(effect):
-    names = [_spelled(name) for name in effect['names']]
+    several = effect.get('members', [])[1:]
+    names = [_spelled(name) for name in (effect['members'] if several else effect['names'])]
     member = next((f' of {kind} {effect[kind]}' for kind in ('rotor', 'joint')
-                   if effect.get(kind)), '')
+                   if effect.get(kind) and not several), '')
     parameter, found = next(iter(effect['parameters'].items()))
     values, own = _list(found['value']), _list(found['file'])
     spans = [] if not found.get('interval') else [found['interval']] if np.ndim(
