@@ -91,10 +91,11 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
     sets = [list(dict.fromkeys(s.entries[j].label if e is slow else s.entries[j].name
                                for j in members)) for e, s, _, _, members in found]
     rest = unexplained(engine, solution)
-    verdict = verdict_of(chance, sets, rest, alpha)
+    fed_back = sorted(solution.entries[k].name.replace('_', ' ') for k in solution.banned)
+    verdict = verdict_of(chance, sets, rest, fed_back, alpha)
     effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]
     return result_of(
-        verdict, groups, reason_of(verdict, sets, rest, chance),
+        verdict, groups, reason_of(verdict, sets, rest, fed_back, chance),
         effects=effects if verdict in NAMING else [],
         partial=[] if verdict in NAMING else effects,
         candidates=sorted((row for (_, s, _), own in zip(tests, taken, strict=True)
@@ -308,8 +309,8 @@ def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: li
             'closure': closure, 'tolerances': tolerances}
 
 
-def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained], alpha: float
-               ) -> str:
+def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
+               fed_back: list[str], alpha: float) -> str:
     """
     Verdict on flights.
 
@@ -317,10 +318,11 @@ def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained], al
         chance: probability of as much evidence without any effect.
         sets: named entries, each with those that could stand in its place.
         rest: tests of what no entry explains, the most improbable first.
+        fed_back: entries that were excluded because of feedback.
         alpha: accepted probability of a false alarm.
 
     """
-    if len(solution.banned) > FEEDBACK:
+    if len(fed_back) > FEEDBACK:
         return 'not_decidable'
     if sets:
         crowd = max(map(len, sets))
@@ -345,17 +347,16 @@ def varied(engine: Engine, solution: Solution) -> list[str]:
     return found
 
 
-def reason_of(verdict: str, sets: list[list[str]], rest: list[Unexplained], chance: float
-              ) -> str:
+def reason_of(verdict: str, sets: list[list[str]], rest: list[Unexplained],
+              fed_back: list[str], chance: float) -> str:
     """Why a verdict without names was reached, as the end of a sentence."""
     if verdict == 'unknown':
         return rest[0].sentence
     if verdict != 'not_decidable':
         return ''
-    if len(solution.banned) > FEEDBACK:
-        return ('the controller answers noise more than it flies: ' + ', '.join(sorted(
-            solution.entries[k].name.replace('_', ' ') for k in solution.banned))
-            + ' have other values at other frequencies')
+    if len(fed_back) > FEEDBACK:
+        return ('the controller answers noise more than it flies: the values of '
+                f"{', '.join(fed_back)} differ between frequencies")
     if sets:
         return f"they do not separate {' and '.join(map(' or '.join, sets))}".replace('_', ' ')
     return ('an effect is more likely than none, but a false alarm would have the probability '
