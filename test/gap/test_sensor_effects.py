@@ -132,7 +132,8 @@ def test_derivatives_by_the_gain_of_a_servo_agree_with_its_joint(gain):
     made, own = model(MOTION.flight()), [f'servo.{gain}[{k}]' for k in range(4)]
     slopes, h = slopes_of(made, [f'joint_bandwidth.{gain}', *own]), 0.01
     for k, name in enumerate(own):
-        moved = (made.residual({name: h}, 'J')['J'] - made.residual({name: -h}, 'J')['J']) / (2 * h)
+        ahead, behind = (made.residual({name: x}, 'J')['J'] for x in (h, -h))
+        moved = (ahead - behind) / (2 * h)
         assert np.abs(moved[:, k]).max() > 1e-3
         assert slopes[:, :, k + 1] == pytest.approx(moved, abs=1e-9)
     assert slopes[:, :, 1:].sum(axis=2) == pytest.approx(slopes[:, :, 0], abs=1e-12)
