@@ -81,7 +81,7 @@ def _draw(axis, sizes):
         axis.plot(middle, k, 'o', color=AFTER, ms=4)
     axis.axvline(0.0, color=BEFORE, lw=0.9)
     axis.set_yticks(np.arange(len(sizes)), [text for text, *_ in sizes])
-    axis.set_xlabel('value minus robot file, in typical sizes; 95 %')
+    axis.set_xlabel('deviation in typical sizes, 95 %')
 
 
 def _sizes(effects):

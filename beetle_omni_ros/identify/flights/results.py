@@ -65,7 +65,8 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
 
 def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: list,
               groups: dict, held_out: bool, starts: Starts | None = None,
-              findings: Sequence[str] = (), slow: Balance | None = None) -> dict:
+              findings: Sequence[str] = (), slow: Balance | None = None,
+              measured: bool = True) -> dict:
     """
     Results of a solution.
 
@@ -79,6 +80,8 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
         starts: as of :class:`~beetle_omni_ros.identify.flights.bag.BagFlight`.
         findings: sentences about the flights.
         slow: balance of torques; the mean of both e-values is one.
+        measured: whether forces are those of an accelerometer. What an estimator makes of the
+            motion repeats as well, and is no force.
 
     """
     alpha = engine.alpha
@@ -90,7 +93,7 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
     taken = [[k for e, _, _, k, _ in found if e is test[0]] for test in tests]
     sets = [list(dict.fromkeys(s.entries[j].label if e is slow else s.entries[j].name
                                for j in members)) for e, s, _, _, members in found]
-    rest = unexplained(engine, solution)
+    rest = unexplained(engine, solution) if measured else []
     fed_back = sorted(solution.entries[k].name.replace('_', ' ') for k in solution.banned)
     verdict = verdict_of(chance, sets, rest, fed_back, alpha)
     effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]

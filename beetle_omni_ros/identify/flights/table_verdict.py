@@ -126,7 +126,8 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
         groups['torque'] = {'used': True, 'channels': ['torque_x', 'torque_y'],
                             'reason': 'no gyroscope: means of 2 s, by the attitude'}
     return concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
-                     findings=findings, slow=Balance(slow, robot) if slow else None)
+                     findings=findings, slow=Balance(slow, robot) if slow else None,
+                     measured='specific_force' in declared.signals)
 
 
 def _groups(flight, declared):
