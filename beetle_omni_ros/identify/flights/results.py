@@ -26,6 +26,7 @@ CROWD = 4               # members of a set from which the flights do not decide
 NAMING = 'named', 'named_set'
 TESTS = 2               # of what is unexplained; they share the accepted probability
 FEEDBACK = 2            # entries that feedback may exclude; with more, the loop hides the robot
+FORM = 0.1              # deviation of a law's value by the error of its form, of the value
 LEAST_TIME = 1.0        # [s] in a regime, of which an RMS is stated
 Starts = dict[str, dict[str, float]]
 
@@ -187,13 +188,15 @@ def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Poster
             if not tangent or tangent == of:
                 row = rows.setdefault(of, np.zeros(len(index)))
                 row[index.index(engine.index[name])] += part
+    law = CATALOGUE[entry.name].layer not in ('sensor', 'timing')
     for parameter, spec in CATALOGUE[entry.name].parameters.items():
         own = [name for name in rows if keys[name].parameter == parameter]
         values, spans = [], []
         for name in own:
             key, row = keys[name], rows[name]
             middle = float(row @ posterior.estimate)
-            half = 1.96 * float(row @ posterior.covariance @ row)**0.5
+            form = FORM * middle if law and not key.relative else 0.0
+            half = 1.96 * float(row @ posterior.covariance @ row + form**2)**0.5
             values.append(key.value(middle))
             spans.append([max(key.value(middle - half), min(spec.low, values[-1])),
                           min(key.value(middle + half), max(spec.high, values[-1]))])
