@@ -74,10 +74,9 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
     less = theta.copy()
     less[engine.indices(named)] = 0.0
     own = engine.flight.copy()
-    varied = engine.indices(solution.best)
     for _, key, column in engine.repeats:
-        if not fitted:      # flights that judge differ as the fitted ones do
-            own[key] = (engine.typical if column in varied else engine.narrow)[column]
+        if not fitted:      # sensors of flights that judge may differ from those of the others
+            own[key] = engine.typical[column]
     every = np.hypot(engine.narrow, own)
     every[engine.indices(named)] += 9 * engine.typical[engine.indices(named)]
     for each in spectra:

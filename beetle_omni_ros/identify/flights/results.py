@@ -100,8 +100,10 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
     effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]
     return result_of(
         verdict, groups, reason_of(verdict, sets, rest, fed_back, chance),
-        effects=effects if verdict in NAMING else [],
-        partial=[] if verdict in NAMING else effects,
+        effects=[effect for effect, members in zip(effects, sets, strict=True)
+                 if verdict in NAMING and len(members) < CROWD],
+        partial=[effect for effect, members in zip(effects, sets, strict=True)
+                 if verdict not in NAMING or len(members) >= CROWD],
         candidates=sorted((row for (_, s, _), own in zip(tests, taken, strict=True)
                            for row in candidates_of(s, own)), key=_rank, reverse=True),
         hidden=[name for _, s, _ in tests for name in hidden_of(s, alpha / len(tests))],
@@ -330,9 +332,11 @@ def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
     """
     if len(fed_back) > FEEDBACK:
         return 'not_decidable'
+    small = [len(members) for members in sets if len(members) < CROWD]
+    if small:
+        return 'named_set' if max(small) > 1 else 'named'
     if sets:
-        crowd = max(map(len, sets))
-        return 'not_decidable' if crowd >= CROWD else 'named_set' if crowd > 1 else 'named'
+        return 'not_decidable'
     if rest and rest[0].probability < alpha / TESTS:
         return 'unknown'
     return 'no_gap' if chance > alpha else 'not_decidable'
