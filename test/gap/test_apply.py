@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.flights.priors import entries_of, Entry
-from beetle_omni_ros.identify.flights.results import FORM, parameters
+from beetle_omni_ros.identify.flights.results import FORM_DEVIATION, parameters
 from beetle_omni_ros.identify.gap.apply import write_corrected
 from beetle_omni_ros.robot.effects import CATALOGUE, ignored
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -55,8 +55,9 @@ def stated(entry, deviation=0.0, half=0.1, starts=None):
 
 
 @pytest.mark.parametrize('name, deviation, expected', [
-    ('rotor_drag.coefficient', 0.03, [0.0, 0.03 + np.hypot(0.1, 1.96 * FORM * 0.03)]),
-    ('axial_inflow.per_rotor', 0.4, 0.4 + np.hypot(0.1, 1.96 * FORM * 0.4) * np.array([-1, 1])),
+    ('rotor_drag.coefficient', 0.03, [0.0, 0.03 + np.hypot(0.1, 1.96 * FORM_DEVIATION * 0.03)]),
+    ('axial_inflow.per_rotor', 0.4,
+     0.4 + np.hypot(0.1, 1.96 * FORM_DEVIATION * 0.4) * np.array([-1, 1])),
     ('joint_feedback_delay.delay', 0.15, [0.05, 0.2])])
 def test_intervals_exclude_impossible_values(name, deviation, expected):
     entry, parameter = name.split('.')

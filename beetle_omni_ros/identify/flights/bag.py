@@ -159,8 +159,7 @@ class BagFlight(FlightModel):
         new = {name: 1.0 for name in self.starts if theta.get(name)}
         for tangent, (name, key) in self.tangents.items():
             if name in new:
-                factor = max(theta[name] + theta.get(tangent, 0.0), LEAST * theta[name])
-                self.starts[name][key] *= max(factor, LEAST)
+                self.starts[name][key] *= max(theta[name] + theta.get(tangent, 0.0), LEAST)
                 new[tangent] = 0.0
         return new
 

@@ -25,8 +25,8 @@ ALPHA = 0.05            # probability of a false alarm that is accepted
 CROWD = 4               # members of a set from which the flights do not decide
 NAMING = 'named', 'named_set'
 TESTS = 2               # of what is unexplained; they share the accepted probability
-FEEDBACK = 2            # entries that feedback may exclude; with more, the loop hides the robot
-FORM = 0.1              # deviation of a law's value by the error of its form, of the value
+MOST_FED_BACK = 2       # entries that feedback may exclude; with more, the loop hides the robot
+FORM_DEVIATION = 0.1    # of a value: deviation by the error of form of its law
 LEAST_TIME = 1.0        # [s] in a regime, of which an RMS is stated
 Starts = dict[str, dict[str, float]]
 
@@ -197,7 +197,7 @@ def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Poster
         for name in own:
             key, row = keys[name], rows[name]
             middle = float(row @ posterior.estimate)
-            form = FORM * middle if law and not key.relative else 0.0
+            form = FORM_DEVIATION * middle if law and not key.relative else 0.0
             half = 1.96 * float(row @ posterior.covariance @ row + form**2)**0.5
             values.append(key.value(middle))
             spans.append([max(key.value(middle - half), min(spec.low, values[-1])),
@@ -330,7 +330,7 @@ def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
         alpha: accepted probability of a false alarm.
 
     """
-    if len(fed_back) > FEEDBACK:
+    if len(fed_back) > MOST_FED_BACK:
         return 'not_decidable'
     small = [len(members) for members in sets if len(members) < CROWD]
     if small:
@@ -364,7 +364,7 @@ def reason_of(verdict: str, sets: list[list[str]], rest: list[Unexplained],
         return rest[0].sentence
     if verdict != 'not_decidable':
         return ''
-    if len(fed_back) > FEEDBACK:
+    if len(fed_back) > MOST_FED_BACK:
         return ('the controller answers noise more than it flies: the values of '
                 f"{', '.join(fed_back)} differ between frequencies")
     if sets:

@@ -4,7 +4,6 @@ from itertools import product
 
 import numpy as np
 
-JITTER = 1e-6       # relative increase of the variance, for series without noise
 LEVELS = 10.0 ** np.arange(0, 5)    # tried variances of a drift
 CORNERS = (0.5, 2.0, 8.0)           # tried
 
