@@ -15,6 +15,7 @@ the limits and the times of the fastest pose.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 import json
 import os
@@ -28,11 +29,11 @@ from rich.table import Table
 
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
-from beetle_omni_ros.evaluation.loop import compute_summary, FlightLoop
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
+from beetle_omni_ros.stack.loop import FlightLoop
 
 TARGETS = {'median': 0.1, 'p99': 0.2}   # [ms] of inference
 
@@ -50,6 +51,14 @@ class TimedPolicy(PolicyController):
         action = self._infer(observation)
         self.times.append(thread_time() - began)
         return action
+
+
+def compute_summary(times: Sequence[float], period: float) -> dict[str, float | int]:
+    """Median, 99th percentile, maximum [ms], misses of ``period`` and number of ``times`` [s]."""
+    used = 1e3 * np.array(times or [0.0])
+    median, p99 = np.percentile(used, [50, 99]).tolist()
+    return {'median': median, 'p99': p99, 'max': float(used.max()),
+            'deadline_misses': int(np.sum(used > 1e3 * period)), 'count': len(times)}
 
 
 def measure(parameters: PolicyParameters, poses: int, seed: int) -> tuple[dict, TimedPolicy]:

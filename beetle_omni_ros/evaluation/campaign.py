@@ -33,7 +33,8 @@ from beetle_omni_ros.robot.schema import ParameterError, RunError
 LIBRARIES = ('casadi', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
 SOURCE = Path(__file__).resolve().parents[1]
 # Folders whose code decides the numbers of a flight and its metrics.
-FLOWN = ('control', 'estimation', 'evaluation', 'messages', 'robot', 'runs', 'safety', 'sim')
+FLOWN = ('control', 'estimation', 'evaluation', 'messages', 'robot', 'runs', 'safety', 'sim',
+         'stack')
 LENGTH = 16  # hexadecimal digits kept of a digest
 OBJECT_STORE = 200 * 2**20  # [byte] shared memory of a local Ray; results are far smaller
 LOST_WORKER = ('TerminatedWorkerError', 'BrokenProcessPool', 'RayActorError', 'ActorDiedError',

@@ -15,7 +15,6 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Controller, guidance_of, reach_of
 from beetle_omni_ros.control.registry import ControllerOptions
-from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.messages.topics import topics_with
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs import table
@@ -26,6 +25,7 @@ from beetle_omni_ros.runs.targets import check_steps
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim.fault_lists import load_faults
 from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.stack.loop import FlightLoop
 
 
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,

@@ -18,7 +18,6 @@ import numpy as np
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.evaluation.campaign import flight_key
-from beetle_omni_ros.evaluation.loop import collector_off, FlightLoop
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag_writer import BagWriter
@@ -29,6 +28,7 @@ from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.fault_lists import Case
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.sensors import Impact, Truth
+from beetle_omni_ros.stack.loop import collector_off, FlightLoop
 
 STARTS = ('hover', 'moving', 'upside_down')      # default
 ALL_STARTS = (*STARTS, 'random')
@@ -194,7 +194,7 @@ def _fly_healthy(trial, recorder, plan):
         flight.aim_randomly()
         flight.fly(plan.pose_time)
     flight.land(lambda: supervisor.state == 'disarmed')
-    alarms = [[event.stamp, event.severity, event.text] for event in supervisor.events
+    alarms = [[event.stamp, event.severity, event.text] for event in flight.loop.events
               if event.severity != INFO]
     alarms += [[stamp, 'fault', name] for name, stamp in supervisor.faults.items()]
     landed = supervisor.state == 'disarmed'
@@ -225,7 +225,7 @@ class Flight:
     def aim(self, position, rpy) -> None:
         """Set the target pose: (3,) in world [m], roll, pitch and yaw [rad]."""
         self.loop.aim(PoseTarget(np.array(position, dtype=float), rotations.from_rpy(*rpy),
-                                 self.loop.now))
+                                 self.loop.now()))
 
     def aim_randomly(self) -> None:
         """Set a random target pose, as of random100."""
@@ -243,7 +243,7 @@ class Flight:
 
     def land(self, over: Callable[[], bool]) -> None:
         """Request a landing and fly on."""
-        self.supervisor.land(self.loop.now)
+        self.loop.request('land')
         self.fly(self.plan.landing_time, over)
 
 
@@ -256,7 +256,7 @@ class Watcher:
         self._flight, self._plan = flight, flight.plan
         self._fence = np.array([own.fence_half_width, own.fence_half_width, own.fence_height])
         self._place, self._start = flight.simulator.truth.position.copy(), flight.simulator.time
-        self._past_events = len(flight.supervisor.events)
+        self._past_events = len(flight.loop.events)
         self._past_faults = set(flight.supervisor.faults)
         self._still = self._down = 0.0
         self._floor: float | None = None
@@ -273,7 +273,7 @@ class Watcher:
         simulator, supervisor = self._flight.simulator, self._flight.supervisor
         truth, tick = simulator.truth, simulator.tick
         self.step(truth, float(simulator.link.thrust.sum()), tick)
-        self.said = self.said or next((event.text for event in supervisor.events[
+        self.said = self.said or next((event.text for event in self._flight.loop.events[
             self._past_events:] if event.severity != INFO), '')
         if not self.named[0]:
             self.named = next(((name, simulator.time - self._start) for name in supervisor.faults

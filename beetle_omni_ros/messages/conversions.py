@@ -195,9 +195,9 @@ def write_odom(value: Any) -> Any:
     message.child_frame_id = BODY
     set_parts(message.twist.twist.linear, rotations.matrix(value.quaternion).T @ value.velocity)
     for part in ('pose', 'twist'):
-        if (matrix := getattr(value, f'{part}_covariance', None)) is not None:
+        if (covariance := getattr(value, f'{part}_covariance', None)) is not None:
             getattr(message, part).covariance = np.ascontiguousarray(
-                matrix, dtype=float).reshape(36)
+                covariance(), dtype=float).reshape(36)
     return message
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -34,8 +34,9 @@ class Odom:
         velocity: (3,) in world [m/s]; the message carries it in base_link.
         quaternion: (4,) body to world, xyzw.
         angular_velocity: (3,) in base_link [rad/s].
-        pose_covariance: (6, 6) of position (world) and small rotation (world axes), or None.
-        twist_covariance: (6, 6) of the twist in base_link, or None. Not read from messages.
+        pose_covariance: computes the (6, 6) of position (world) and small rotation (world axes)
+            when the message is written, or None. Not read from messages.
+        twist_covariance: the same of the twist in base_link.
 
     """
 
@@ -44,14 +45,8 @@ class Odom:
     velocity: np.ndarray
     quaternion: np.ndarray
     angular_velocity: np.ndarray
-    pose_covariance: np.ndarray | None = None
-    twist_covariance: np.ndarray | None = None
-
-    @classmethod
-    def of(cls, state: Any, *covariances: np.ndarray) -> Odom:
-        """Stamp, pose and velocities of an estimate or state, with covariances."""
-        return cls(state.stamp, state.position, state.velocity, state.quaternion,
-                   state.angular_velocity, *covariances)
+    pose_covariance: Callable[[], np.ndarray] | None = None
+    twist_covariance: Callable[[], np.ndarray] | None = None
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from beetle_omni_ros.nodes.graph import (
     plan,
     reserved_domain,
 )
-from beetle_omni_ros.nodes.node import ERROR
 from beetle_omni_ros.nodes.operator import Operator, TAKEOFF_TIMEOUT
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
@@ -33,6 +32,7 @@ from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim.fault_lists import load_faults
 from beetle_omni_ros.sim.faults import DEVICES
+from beetle_omni_ros.stack.component import ERROR
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start

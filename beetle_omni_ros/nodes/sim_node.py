@@ -1,21 +1,17 @@
 """ROS node of the simulated robot, with topics or emulated serial devices as actuators."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from math import degrees
+from dataclasses import dataclass
 import time
 
-import numpy as np
 from rosgraph_msgs.msg import Clock
 
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.messages.conversions import set_time
 from beetle_omni_ros.messages.topics import SENSOR
-from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
+from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.nodes.parameters import file_parameter
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError, RunError
 from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
 from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
@@ -23,6 +19,8 @@ from beetle_omni_ros.sim.fault_lists import parse_faults
 from beetle_omni_ros.sim.faults import DEVICES
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
+from beetle_omni_ros.stack.component import OK, WARN
+from beetle_omni_ros.stack.simulated import SimulatedRobot
 
 # Ticks that are caught up after a stall of the computer; more would delay the next ones.
 CATCH_UP_TICKS = 8
@@ -32,8 +30,6 @@ SLEW = 0.01             # largest shift of a tick to a later time, in ticks
 # is one period old. It does not wait for a node that has stopped.
 LAG = 0.02              # s between the newest sample and the newest answered one
 PATIENCE = 0.3          # s of steady time without an answer after which a node has stopped
-COMMAND_AGE = 0.1       # s, older commands are not executed
-HOPELESS = 10.0     # times what all rotors produce: a larger disturbance is a mistake
 
 
 class RealTimePacing:
@@ -143,38 +139,28 @@ class SimNode(FlightNode):
     and supervisor have answered the newest samples.
     """
 
+    component: SimulatedRobot
+
     def __init__(self):
         self._devices: EmulatedActuators | None = None
         self._clock_publisher = None
         super().__init__('sim_node', SimNodeParameters, on_change=self._changed, changeable=(
             'payload', 'faults', 'servo_faults.', 'board_faults.'))
-        given = self.parameters
-        robot = RobotParameters.load(given.robot_file or None)
+        given, robot = self.parameters, self.robot
         self._simulator = Simulator(
             robot, SimulatorParameters.load(given.simulator_file or None),
             conditions=given.conditions, seed=given.seed)
-        lift = HOPELESS * 4 * robot.rotors.thrust_max
-        self._most_wrench = lift, lift * np.linalg.norm(robot.rotors.positions, axis=1).max()
         self._pacing = self._make_pacing(given)
-        self._latency = Distribution()
-        topics = {'mocap': 'mocap/pose', 'imu': 'imu/data_raw'}
         if given.actuators == 'emulated':
             self._devices = self._make_devices(given, robot)
-            self.report('devices', self._devices_status)
-        else:
-            topics |= {'joints': 'joint_states', 'rotors': 'rotor_states',
-                       'battery': 'battery_state'}
-            self.listen('command', self._on_command, max_age=COMMAND_AGE)
-            self.report('latency', lambda: self._latency.status(
-                'stamp of the answered IMU sample to the arrival of its command'))
         self._changed(given)
-        self._publish_to = {name: wire.Publisher(self, topic) for name, topic in topics.items()}
-        self._truth = wire.Publisher(self, 'ground_truth/odom')
-        self.listen('disturbance', self._on_disturbance, expected=False)
-        self.track_compute(self._simulator.tick)
-        self.report('pacing', self._pacing_status)
-        self.report('robot', self._robot_status)
-        self.create_timer(self._simulator.tick, self._on_timer, clock=self.steady_clock)
+        component = SimulatedRobot(self._simulator, robot, self._devices)
+        component.report('pacing', self._pacing_status)
+        component.every(self._simulator.tick, self._on_timer, steady=True)
+        if given.clock == 'simulated':
+            component.on_answer = self._pacing.answered
+            component.reads('odom', lambda odom: self._pacing.answered('odom', odom.stamp))
+        self.run(component)
 
     def _make_pacing(self, given):
         if given.clock == 'system':
@@ -182,10 +168,8 @@ class SimNode(FlightNode):
         if given.actuators == 'emulated':
             raise ParameterError("key 'clock': simulated: serial devices keep real time; start "
                                  'with actuators:=direct')
-        pacing = SimulatedTimePacing(self._simulator.tick, super().now())
         self._clock_publisher = self.create_publisher(Clock, '/clock', wire.profile(SENSOR))
-        self.listen('odom', lambda odom: pacing.answered('odom', odom.stamp))
-        return pacing
+        return SimulatedTimePacing(self._simulator.tick, super().now())
 
     def now(self) -> float:
         """Return ROS time [s]; this node is the source of simulated time."""
@@ -193,16 +177,12 @@ class SimNode(FlightNode):
 
     def _make_devices(self, given, robot):
         """Connect emulated devices to the plant, for the drivers of the bridges."""
-        from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard  # has pymavlink
-        from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
         servos = ServoBusParameters.load(given.servo_bus_file or None)
-        bus = EmulatedServoBus(
-            servos.ids.astype(int).tolist(), port=given.servo_port or None,
-            signs=servos.signs.astype(int).tolist(), zeros=servos.zeros.astype(int).tolist(),
-            seed=given.seed)
-        board = EmulatedMotorBoard(robot, seed=given.seed, port=given.board_port or None)
-        self.get_logger().info(f'servos at {bus.port}, motor board at {board.port}')
-        return EmulatedActuators(self._simulator, bus, board)
+        devices = EmulatedActuators.of(self._simulator, robot, servos, seed=given.seed,
+                                       servo_port=given.servo_port, board_port=given.board_port)
+        self.get_logger().info(f'servos at {devices.bus.port}, motor board at '
+                               f'{devices.board.port}')
+        return devices
 
     def close(self) -> None:
         """Switch the emulated devices off."""
@@ -230,43 +210,21 @@ class SimNode(FlightNode):
             self.get_logger().info(f"faults: {active or 'none'}, payload {new.payload:g} kg")
 
     def _on_timer(self):
-        step = (self._devices or self._simulator).step
-        for _ in range(self._pacing.due()):
+        component, pacing = self.component, self._pacing
+        for _ in range(pacing.due()):
+            component.epoch = pacing.epoch
             try:
-                frame = self.timed(step)
+                frame = component.advance()
             except RunError as error:
                 self.stop.set_exception(error)
                 return
             if self._clock_publisher is not None:
                 message = Clock()
-                set_time(message.clock, self._pacing.now)
+                set_time(message.clock, pacing.now)
                 self._clock_publisher.publish(message)
                 if frame.imu is not None:
-                    self._pacing.sent = self._pacing.epoch + frame.imu.stamp
-            self._publish(frame)
-
-    def _publish(self, frame):
-        epoch = self._pacing.epoch
-        # Delayed readings first: the IMU sample triggers the estimate, which should include them.
-        for name in ('mocap', 'joints', 'imu', 'rotors', 'battery'):
-            reading = getattr(frame, name)
-            if reading is not None and name in self._publish_to:
-                self._publish_to[name].publish(replace(reading, stamp=epoch + reading.stamp))
-        self._truth.publish(replace(frame.truth, stamp=epoch + frame.truth.stamp))
-
-    def _on_command(self, command):
-        self._latency.add(self.now() - command.stamp)
-        if self._clock_publisher is not None:
-            self._pacing.answered('command', command.stamp)
-        if self._pacing.epoch is not None:
-            self._simulator.command(replace(command, stamp=command.stamp - self._pacing.epoch))
-
-    def _on_disturbance(self, wrench):
-        size, most = np.linalg.norm([wrench.force, wrench.torque], axis=1), self._most_wrench
-        if (size > most).any():
-            raise MessageError('{:.3g} N and {:.3g} N m, expected at most {:.3g} N and {:.3g} N m'
-                               .format(*size, *most), 'too large')
-        self._simulator.wrench = np.concatenate([wrench.force, wrench.torque])
+                    pacing.sent = pacing.epoch + frame.imu.stamp
+            component.publish(frame)
 
     def _pacing_status(self):
         pacing = self._pacing
@@ -275,19 +233,3 @@ class SimNode(FlightNode):
             'ticks': pacing.ticks, 'lost_ticks': pacing.lost_ticks,
             'lost_s': pacing.lost_ticks * self._simulator.tick,
             'simulated_s': self._simulator.time}
-
-    def _robot_status(self):
-        simulator = self._simulator
-        faults, impact = simulator.faults, simulator.truth.impact
-        values = {'faults': ', '.join(faults), 'broken': int(simulator.truth.broken)}
-        if impact is not None:
-            values.update(impact_m_s=impact.speed, impact_s=impact.stamp,
-                          inclination_deg=degrees(impact.inclination))
-        if simulator.truth.broken:
-            return ERROR, 'broken by a crash', values
-        return WARN if faults else OK, values['faults'] or 'whole', values
-
-    def _devices_status(self):
-        faults = self._devices.faults
-        level = WARN if faults else OK
-        return level, 'faults: ' + (', '.join(faults) or 'none'), self._devices.status()

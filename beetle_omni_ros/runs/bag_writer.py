@@ -98,8 +98,6 @@ class BagWriter(Recorder, AbstractContextManager):
     declaration follows messages. A topic that is declared later starts a new chunk.
     """
 
-    keeps_covariances = True
-
     def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
                  topics: Sequence[str] = tuple(TOPICS), frames: bool = False, epoch: int = 0):
         """

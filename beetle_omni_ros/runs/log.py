@@ -170,19 +170,10 @@ class FlightLog:
 
 
 class Recorder:
-    """
-    Interface of recorders; by itself it passes everything on to others.
-
-    Attributes:
-        keeps_covariances: whether the covariances of ``odom`` are recorded.
-
-    """
-
-    keeps_covariances = False
+    """Interface of recorders; by itself it passes everything on to others."""
 
     def __init__(self, *others: Recorder):
         self._others = others
-        self.keeps_covariances = any(other.keeps_covariances for other in others)
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
         """

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.evaluation import command, loop
+from beetle_omni_ros.evaluation import command
 from beetle_omni_ros.evaluation.campaign import own_files
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -21,6 +21,7 @@ from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.stack import loop
 
 ROBOT = RobotParameters.load()
 CAPACITY = 0.0975   # [A h] of a pack that does not last for two poses

@@ -20,8 +20,8 @@ def truth(t, height=1.0, x=0.0, contact=False, impact=None, broken=False):
 def watch():
     return Watcher(SimpleNamespace(
         plan=PLAN, simulator=SimpleNamespace(truth=truth(0.0, 0.0), time=0.0),
-        supervisor=SimpleNamespace(events=[], faults={}, state='disarmed'),
-        loop=SimpleNamespace(refusals=[])))
+        supervisor=SimpleNamespace(faults={}, state='disarmed'),
+        loop=SimpleNamespace(refusals=[], events=[])))
 
 
 def soft(t=1.0, speed=0.3, inclination=0.05):

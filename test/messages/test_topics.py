@@ -1,6 +1,7 @@
 """The table of topics: nodes and bags write the same bytes and read the same values."""
 
 from dataclasses import fields, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def value(topic, seed=0, stamp=STAMP):
         BatteryReading: lambda: BatteryReading(stamp, 24.5, -20.25),
         RotorReading: lambda: RotorReading(stamp, draw(size=4)),
         Odom: lambda: Odom(stamp, draw(size=3), draw(size=3), turn, draw(size=3),
-                           draw(size=(6, 6)), draw(size=(6, 6))),
+                           *(partial(np.copy, draw(size=(6, 6))) for _ in range(2))),
         PoseTarget: lambda: PoseTarget(draw(size=3), turn, stamp),
         TrajectoryTarget: lambda: path,
         Command: lambda: Command(stamp, draw(size=4), draw(size=4)),

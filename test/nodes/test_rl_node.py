@@ -15,7 +15,7 @@ from policy_files import write
 def test_the_executable_flies_the_given_policy(make, tmp_path):
     node = make(maker('rl_node'), f"policy:={write(tmp_path / 'policy.onnx', bias=[0.1] * 8)}")
     assert node.parameters.policy.endswith('policy.onnx')
-    assert node._controller_status()[2]['policy'] == 'rl'
+    assert node.component._controller_status()[2]['policy'] == 'rl'
 
 
 def test_files_reach_their_nodes_and_a_shipped_policy_that_does_not_fit_is_left_out(tmp_path):

@@ -1,15 +1,13 @@
 """sim_node with emulated actuators: ports instead of topics, faults in flight."""
 
 import os
-import re
 
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 
-from beetle_omni_ros.messages.values import MessageError, Wrench
-from beetle_omni_ros.nodes import node as base
 from beetle_omni_ros.nodes.sim_node import SimNode
+from beetle_omni_ros.stack import component as base
 
 pytestmark = pytest.mark.real_time
 
@@ -38,9 +36,9 @@ def test_faults_are_switched_in_flight_and_reported(sim):
     assert {'/joint_states', '/battery_state'} <= published and '/command' in subscribed
     refused = put(node, servo_faults__silent=[2])
     assert not refused.successful and 'silent [2]: there are no' in refused.reason
-    assert node._robot_status()[0] == base.OK
+    assert node.component._robot_status()[0] == base.OK
     node._simulator.step()
-    level, text, values = node._robot_status()
+    level, text, values = node.component._robot_status()
     assert level == base.WARN and text == 'mocap_lost' and values['broken'] == 0
     assert put(node, faults='mocap_lost; rotor_stops rotor=2').successful
     node._simulator.step()
@@ -50,22 +48,6 @@ def test_faults_are_switched_in_flight_and_reported(sim):
     assert node._simulator.faults == ['mocap_lost', 'rotor_stops']
     assert put(node, faults='').successful
     assert node._simulator.faults == []
-
-
-@pytest.mark.parametrize('force, torque, refused', [
-    ([0, 0, 1e9], [0, 0, 0], '1e+09 N and 0 N m, expected at most 800 N and 221 N m'),
-    ([0, 0, 0], [0, -1e3, 0], '0 N and 1e+03 N m, expected at most 800 N and 221 N m'),
-    ([0, 0, 100], [100, 0, 0], '')])      # the highest levels of tasks
-def test_a_disturbance_beyond_any_controller_is_refused(sim, force, torque, refused):
-    node, given = sim(actuators='direct'), Wrench(0.0, np.array(force), np.array(torque))
-    before = node._simulator.wrench
-    if refused:
-        with pytest.raises(MessageError, match=re.escape(refused)):
-            node._on_disturbance(given)
-        assert node._simulator.wrench is before
-    else:
-        node._on_disturbance(given)
-        np.testing.assert_array_equal(node._simulator.wrench, [*force, *torque])
 
 
 def test_the_simulator_publishes_simulated_time_only_without_serial_devices(sim):
@@ -86,11 +68,11 @@ def test_faults_of_devices_change_in_flight_and_are_in_the_diagnostics(sim, tmp_
     assert set(bus.faults.overload) == {3}
     assert put(node, servo_faults__overload=[], servo_faults__silent=[2],
                board_faults__drop_in=0.5).successful
-    level, text, values = node._devices_status()
+    level, text, values = node.component._devices_status()
     assert level == base.WARN and text == 'faults: servo silent [2], board drop_in 0.5'
     assert values['armed'] is False and values['torque'] == [False] * 4
     assert put(node, servo_faults__silent=[], board_faults__drop_in=0.0).successful
-    assert node._devices_status()[0] == base.OK
+    assert node.component._devices_status()[0] == base.OK
     refused = put(node, servo_faults__silent=[9])
     assert not refused.successful and 'servo_faults: no servo has' in refused.reason
     assert node._devices.faults == []

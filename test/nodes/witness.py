@@ -10,8 +10,7 @@ import pytest
 import rclpy
 from rclpy.experimental.events_executor import EventsExecutor
 
-from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.topics import EVENT, SENSOR, topic_of
+from beetle_omni_ros.messages.topics import EVENT, SENSOR
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import COMPOSED, Graph
 from beetle_omni_ros.nodes.operator import Operator
@@ -19,23 +18,6 @@ from beetle_omni_ros.nodes.operator import Operator
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
 BUSY = 0.85         # share of a core above which tests are not valid
 READY = 240     # s; without a cache the controller is compiled first
-
-
-class Sent(list):
-    """A publisher of a topic that keeps its messages."""
-
-    def __init__(self, topic):
-        super().__init__()
-        self._topic, self.value = topic, None
-
-    def publish(self, value):
-        self.value = value
-        self.append(topic_of(self._topic).write(value))
-
-    update = wire.Publisher.update
-
-    def stamps(self):
-        return np.array([conversions.seconds(message.header.stamp) for message in self])
 
 
 def cpu_seconds(pid):

@@ -89,10 +89,9 @@ def write_truth(recorder, t, position, quaternion, velocity, angular_velocity):
     recorder.write('ground_truth/odom', Odom(t, position, velocity, quaternion, angular_velocity))
 
 
-def write_odom(recorder, t, position, quaternion, velocity, angular_velocity, *covariances):
-    """Record an estimate; velocity in world; covariances as :class:`Odom` has them."""
-    recorder.write('odom', Odom(t, position, velocity, quaternion, angular_velocity,
-                                *covariances))
+def write_odom(recorder, t, position, quaternion, velocity, angular_velocity):
+    """Record an estimate; velocity in world."""
+    recorder.write('odom', Odom(t, position, velocity, quaternion, angular_velocity))
 
 
 def write_imu(recorder, t, specific_force, angular_velocity):

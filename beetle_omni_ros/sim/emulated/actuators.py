@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from math import ceil
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
 from beetle_omni_ros.sim.faults import Drive
@@ -38,6 +39,22 @@ class EmulatedActuators:
         bus.set_state(truth.tilt, truth.tilt_velocity, np.zeros(4))
         board.set_rotors(truth.thrust)
         board.set_battery(simulator.battery.voltage, simulator.battery.current)
+
+    @classmethod
+    def of(cls, simulator: Simulator, robot: RobotParameters, servos: Any, *, seed: int = 0,
+           servo_port: str = '', board_port: str = '') -> EmulatedActuators:
+        """
+        Make and connect both devices.
+
+        ``servos`` has ids, signs and zeros of the servos; a port '' is a temporary one.
+        """
+        from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard  # has pymavlink
+        from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
+        bus = EmulatedServoBus(
+            servos.ids.astype(int).tolist(), port=servo_port or None,
+            signs=servos.signs.astype(int).tolist(), zeros=servos.zeros.astype(int).tolist(),
+            seed=seed)
+        return cls(simulator, bus, EmulatedMotorBoard(robot, seed=seed, port=board_port or None))
 
     def close(self) -> None:
         """Stop both devices and remove their ports."""

@@ -3,12 +3,12 @@
 import numpy as np
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task
 from beetle_omni_ros.safety.supervisor import HANDOVER_TIME, THRUST_RATE, TILT_RATE
+from beetle_omni_ros.stack.loop import FlightLoop
 
 ROBOT = RobotParameters.load()
 POSES, SWITCHES = 2, 20
@@ -20,15 +20,15 @@ class Switching(LogRecorder):
 
     def __init__(self, times):
         super().__init__()
-        self.supervisor, self.times, self.switched = None, list(times), []
+        self.flight, self.times, self.switched = None, list(times), []
 
     def write(self, topic, value, received=None):
         super().write(topic, value, received)
         t = value.stamp if topic == 'odom' else -np.inf
-        if self.times and t >= self.times[0] and self.supervisor.state == 'flying':
+        if self.times and t >= self.times[0] and self.flight.supervisor.state == 'flying':
             self.times.pop(0)
-            other = 'rl' if self.supervisor.active == 'nmpc' else 'nmpc'
-            assert self.supervisor.select(other, t)
+            other = 'rl' if self.flight.supervisor.active == 'nmpc' else 'nmpc'
+            assert self.flight.select(other)
             self.switched.append((t, other))
 
 
@@ -37,7 +37,7 @@ def test_twenty_switches_at_random_times_of_random_poses():
     recorder, task = Switching(times), make_task(f'random{POSES}', 1)
     controllers = {name: registry.find(name).make(ROBOT) for name in ('nmpc', 'rl')}
     flight = FlightLoop(ROBOT, ROBOT, controllers, recorder)
-    recorder.supervisor = flight.supervisor
+    recorder.flight = flight
     assert flight.fly(task) and len(recorder.switched) == SWITCHES
     log = recorder.log()
     # every switch takes effect at its time, and nothing else changes the state

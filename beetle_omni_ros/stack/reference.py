@@ -1,0 +1,104 @@
+"""The source of a task's targets as a component."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from beetle_omni_ros.control.base import MOTORS_OFF, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.messages.topics import SENSOR
+from beetle_omni_ros.messages.values import Wrench
+from beetle_omni_ros.runs.tasks import Task, TaskPlayer, WITH_WRENCHES
+from beetle_omni_ros.safety.events import INFO
+from beetle_omni_ros.stack.component import Component, OK
+
+PERIOD = 0.02           # [s] between updates of the task
+IMPULSE_PERIOD = 0.005  # [s] the same for tasks with impulses of 50 ms
+# A trajectory is published in overlapping windows: a reader would need tenths of a second to
+# decode the whole of it, and a node that starts late soon receives the next window.
+WINDOW, WINDOW_PERIOD = 3.0, 1.5    # [s]
+STATE = 'reference/state'
+WAITING, DONE, ABORTED = 'waiting', 'done', 'aborted'
+
+
+class Reference(Component):
+    """
+    Publishes the targets of a task, beginning when the supervisor reports 'flying'.
+
+    ``reference/state`` (latched) is 'waiting', 'flying 3/15', 'done',
+    'done: control lost at level 60', or 'aborted' if the flight ended before the task.
+    ``hang`` is called with each new payload of the task [kg].
+    """
+
+    def __init__(self, task: Task, hang: Callable[[float], None]):
+        super().__init__('reference_node')
+        self._task, self._hang = task, hang
+        self._player = self._odom = self._trajectory = None
+        self._window_end = 0.0
+        self.writes('target_pose', 'target_trajectory', 'disturbance', STATE)
+        self.follows('supervisor/state', self._on_supervisor)
+        disturbed = task.kind in WITH_WRENCHES
+        if disturbed:       # the loss of control ends tasks with rising levels
+            self.reads('odom', self._on_odom, qos=SENSOR)
+        self.report('task', lambda: (OK, self.state, {'task': task.name}))
+        self.every(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer)
+
+    def start(self) -> None:
+        """Publish the state."""
+        self.update(STATE, WAITING)
+
+    @property
+    def state(self) -> str:
+        """Newest value of ``reference/state``."""
+        return self.newest[STATE]
+
+    def _on_odom(self, odom):
+        self._odom = odom
+
+    def _on_supervisor(self, state):
+        if self.state == WAITING and state.startswith('flying'):
+            self._player = TaskPlayer(self._task, self.host.now())
+            self.host.log(INFO, f"task '{self._task.name}', {self._task.ends[-1]:g} s")
+        elif self._player and state.partition(':')[0] in ('landing', *MOTORS_OFF):
+            self._player = None
+            self.update(STATE, ABORTED)
+
+    def _on_timer(self):
+        if self._player is None:
+            return
+        now, player = self.host.now(), self._player
+        over = player.update(now, *((self._odom.position, self._odom.quaternion)
+                                    if self._odom else ()))
+        target, segment = player.target, player.segment
+        if isinstance(target, PoseTarget):
+            self._trajectory = None
+            self.send('target_pose', target)
+        elif target is not None:
+            self._trajectory, self._window_end = target, target.times[0]
+        if self._trajectory is not None and now > self._window_end - WINDOW_PERIOD:
+            self._publish_window(now)
+        if player.changed and self._task.kind in WITH_WRENCHES:
+            self.send('disturbance', Wrench(now, segment.force_world, segment.torque_body))
+        if player.changed and self._task.kind == 'payload':
+            self._hang(float(segment.payload))
+        if over:
+            level = player.lost_level
+            lost = '' if level is None else f': control lost at level {level:g}'
+            self._player = self._trajectory = None
+            self.update(STATE, f'{DONE}{lost}')
+        else:
+            ends = self._task.ends
+            current = 1 + int(np.searchsorted(ends, now - player.start, 'right'))
+            self.update(STATE, f'flying {min(current, len(ends))}/{len(ends)}')
+
+    def _publish_window(self, now):
+        """Publish the trajectory's own points from now on, so that no reader sees it changed."""
+        path = self._trajectory
+        last = len(path.times) - 1
+        begin = min(max(int(np.searchsorted(path.times, now, 'right')) - 1, 0), last - 1)
+        end = min(max(int(np.searchsorted(path.times, path.times[begin] + WINDOW)), begin + 1),
+                  last)
+        part = slice(begin, end + 1)
+        self.send('target_trajectory', TrajectoryTarget(
+            path.times[part], path.positions[part], path.quaternions[part], path.velocities[part],
+            path.angular_velocities[part], stamp=float(path.times[begin])))
+        self._window_end = path.times[end] if end < last else float('inf')
