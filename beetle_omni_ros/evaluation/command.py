@@ -56,10 +56,9 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         if bag is not None:
             from beetle_omni_ros.runs.bag_writer import BagWriter
             recorder = Recorder(memory, stack.enter_context(BagWriter(
-                bag, meta=meta, topics=tuple(topics_with([entry.name])), frames=True,
-                epoch=int(time()))))
+                bag, meta=meta, topics=tuple(topics_with([entry.name])), frames=True)))
         FlightLoop(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
-                   faults=faults).fly(task, progress)
+                   faults=faults, epoch=int(time())).fly(task, progress)
     return memory.log()
 
 

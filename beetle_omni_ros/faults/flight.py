@@ -124,7 +124,7 @@ def fly_trial(trial: Trial, case: Case, bags: Path | None = None, plan: Plan = P
     try:
         with collector_off(), ExitStack() as stack:
             recorder = stack.enter_context(BagWriter(
-                bags / trial.name, asdict(trial), epoch=int(time()))) if bags else Recorder()
+                bags / trial.name, asdict(trial))) if bags else Recorder()
             result.update(_fly_healthy(trial, recorder, plan) if case == HEALTHY
                           else _fly_fault(trial, case, recorder, plan))
     except Exception as error:          # the campaign continues and reports the error
@@ -194,9 +194,10 @@ def _fly_healthy(trial, recorder, plan):
         flight.aim_randomly()
         flight.fly(plan.pose_time)
     flight.land(lambda: supervisor.state == 'disarmed')
-    alarms = [[event.stamp, event.severity, event.text] for event in flight.loop.events
+    epoch = flight.loop.epoch
+    alarms = [[event.stamp - epoch, event.severity, event.text] for event in flight.loop.events
               if event.severity != INFO]
-    alarms += [[stamp, 'fault', name] for name, stamp in supervisor.faults.items()]
+    alarms += [[stamp - epoch, 'fault', name] for name, stamp in supervisor.faults.items()]
     landed = supervisor.state == 'disarmed'
     return {'flown_s': simulator.time - start, 'state': supervisor.state, 'alarms': alarms,
             'outcome': 'flies_on' if landed else 'does not land', 'good': landed and not alarms}
@@ -215,7 +216,7 @@ class Flight:
             true, conditions = replace(true, effects=true.effects | EFFECTS), 'nominal'
         self.plan = plan
         self.loop = FlightLoop(nominal, true, aboard, recorder, conditions=conditions,
-                               seed=trial.seed, faults=case.strike)
+                               seed=trial.seed, faults=case.strike, epoch=int(time()))
         self.simulator, self.supervisor = self.loop.simulator, self.loop.supervisor
         # With other moves for each fault, a seed is not one move.
         self.random = np.random.default_rng(

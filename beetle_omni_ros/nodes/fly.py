@@ -21,7 +21,7 @@ from beetle_omni_ros.nodes.graph import (
     plan,
     reserved_domain,
 )
-from beetle_omni_ros.nodes.operator import Operator, TAKEOFF_TIMEOUT
+from beetle_omni_ros.nodes.operator import NEVER, Operator
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs import table
@@ -33,10 +33,12 @@ from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim.fault_lists import load_faults
 from beetle_omni_ros.sim.faults import DEVICES
 from beetle_omni_ros.stack.component import ERROR
+from beetle_omni_ros.stack.loop import ARMING_TIME
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
 LANDING_TIMEOUT = 30.0  # s
+TICK = 0.005            # s between two attempts to arm in simulated time
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
 
 # s lost by the simulator above which a failure is attributed to the slow computer: the actuators
@@ -83,6 +85,9 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             conditions=conditions, seed=int(seed),
             task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
             ports=str(folder), clock=clock, actuators=_checked(injected, actuators))
+        nodes['sim_node']['task_faults'] = '; '.join(map(str, injected))
+        if clock == 'simulated':    # it begins when all nodes are there
+            nodes['sim_node']['pause_at'] = 0.0
         for name, reason in left_out.items():
             _print(console, f'{name} does not stand by: {reason}')
         controller = registry.find(controller).name
@@ -101,8 +106,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         graph = Graph(nodes, folder, number)
         failure = slow = ''
         try:
-            failure, slow = _fly(graph, controller, flown_task, console,
-                                 '; '.join(map(str, injected)))
+            failure, slow = _fly(graph, controller, flown_task, console, clock == 'simulated')
         except KeyboardInterrupt:
             meta['interrupted'] = True
         if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
@@ -160,14 +164,14 @@ def _complain(error):
 
 
 def _fly(graph: Graph, controller: str, task: Task, console: Console,
-         faults: str) -> tuple[str, str]:
+         simulated: bool) -> tuple[str, str]:
     """Fly, and return why the flight failed, or '', and :meth:`Flight.slow`."""
     failure, flight = '', None
     try:
         graph.start()
         with console.status('starting') as status:
             flight = Flight(graph, controller, task, status.update)
-            for part in (lambda: flight.fly(faults), flight.land):
+            for part in (lambda: flight.fly(simulated), flight.land):
                 try:
                     part()
                 except RunError as error:
@@ -193,21 +197,26 @@ class Flight(Operator):
         super().__init__(graph.domain, controller)
         self._graph, self._task, self.show, self._lands = graph, task, show, False
         self._lost_before = float('inf')    # s, of the simulator before the take-off
+        self._paused = NEVER    # s, at which simulated time stands still
         self.required = [node for node in graph.nodes if node in BRIDGES]
 
-    def fly(self, faults: str) -> None:
+    def fly(self, simulated: bool = False) -> None:
         """
-        Wait for the graph, take off and fly the task, with faults of sim_node, to its end.
+        Wait for the graph, take off and fly the task to its end.
 
-        A RunError reports a failure.
+        With ``simulated`` time the robot arms at the moment at which the loop arms it. A RunError
+        reports a failure.
         """
         self.expect('starting (the first time compiles the controller)',
                     lambda: self.ready and self.progress, READY_TIMEOUT)
         self.expect('actuators and simulator', lambda: not self.waits_for(self.required)
                     and PACING in self.diagnostics, BRIDGES_TIMEOUT)
         self._lost_before = self._lost_time()
+        if simulated:
+            self._paused = ARMING_TIME
+            self.pause_at(ARMING_TIME)
         self.take_off()
-        self._fly_task(faults)
+        self._fly_task()
 
     def slow(self) -> str:
         """Return a text if the computer was too slow, else ''."""
@@ -219,13 +228,16 @@ class Flight(Operator):
         """Return the time that the simulator skipped because it was late [s]."""
         return float(self.values(PACING).get('lost_s', 0.0))
 
-    def _fly_task(self, faults):
+    def arm(self) -> tuple[bool, str]:
+        """Ask the supervisor to arm; simulated time stands still until it does."""
+        accepted, answer = super().arm()
+        if self._paused < NEVER:
+            self._paused = NEVER if accepted else self._paused + TICK
+            self.pause_at(self._paused)
+        return accepted, answer
+
+    def _fly_task(self):
         name, start = self._task.name, self.time()
-        if faults:      # as the task begins, so that their times count from there
-            self.expect(name, lambda: self.progress.startswith('flying'), TAKEOFF_TIMEOUT)
-            accepted, answer = self.set('sim_node', 'faults', faults)
-            if not accepted:
-                raise RunError(f'sim_node refuses the faults: {answer}')
 
         def is_done():
             self.show(f'{name}: {self.progress}, {self.time() - start:.0f} of '

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
+import math
 import os
 import time
 from typing import Any
@@ -29,9 +30,11 @@ from beetle_omni_ros.robot.schema import ParameterError, RunError
 # time for each second of the timeout.
 SLOWEST = 20.0
 ARM_TIMEOUT = 10.0      # s
+PAUSE_TIMEOUT = 10.0    # s
 TAKEOFF_TIMEOUT = 30.0  # s
 TAKEOFF_ATTEMPTS = 3
 SETTLE_TIME = 1.0       # s before arming, in which start-up work ends
+NEVER = 1e9             # s, time at which simulated time does not stand still
 SERVICES = ('arm', 'disarm', 'land', 'emergency_stop')
 SUPERVISOR = 'supervisor_node'
 # Topic -> attribute of its values that changes with every sample of a working sensor.
@@ -107,7 +110,7 @@ class Operator(Client):
         self.bridges: dict[str, str] = {}
         self.diagnostics: dict[str, Diagnostic] = {}
         self._offset: float | None = None   # s from /clock to time(), which goes on steadily
-        self._clock = 0.0
+        self._clock = self._epoch = 0.0
         node = self._node
         node.create_subscription(Clock, '/clock', self._on_clock, wire.profile(SENSOR))
         wire.subscribe(node, 'supervisor/state', self._on_state)
@@ -124,6 +127,7 @@ class Operator(Client):
         self._clock = seconds_of(message.clock)
         if self._offset is None:
             self._offset = time.monotonic() - self._clock
+            self._epoch = math.floor(self._clock)
 
     def _on_state(self, text):
         state = text.partition(':')[0]
@@ -151,9 +155,8 @@ class Operator(Client):
                          if not text.startswith(READY))
 
     def spin(self, seconds: float) -> None:
-        """Process messages for ``seconds``."""
-        for left in self.countdown(seconds):
-            self._executor.spin_once(timeout_sec=min(left, 0.1))
+        """Process messages for ``seconds`` of steady time."""
+        self.spin_steadily(seconds)
 
     def countdown(self, seconds: float) -> Iterator[float]:
         """Yield the remaining time [s], steady or simulated, until it is over."""
@@ -183,7 +186,7 @@ class Operator(Client):
         answers = []
         for _ in range(TAKEOFF_ATTEMPTS):
             self.spin(SETTLE_TIME)
-            self.expect('arming', lambda: answers.append(self.call('arm')) or answers[-1][0],
+            self.expect('arming', lambda: answers.append(self.arm()) or answers[-1][0],
                         ARM_TIMEOUT, lambda: f'; supervisor_node: {answers[-1][1]}')
             self.states.clear()
             # The state may name a fault: disarmed:joint1_astray.
@@ -192,6 +195,23 @@ class Operator(Client):
             if self.state.startswith('flying'):
                 return
         raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
+
+    def arm(self) -> tuple[bool, str]:
+        """Ask the supervisor to arm; return (accepted, answer)."""
+        return self.call('arm')
+
+    def pause_at(self, moment: float) -> None:
+        """
+        Let simulated time run to ``moment`` since its start [s], and stand still there.
+
+        NEVER ends the pause. What is done meanwhile has its effect at that moment.
+        """
+        accepted, answer = self.set('sim_node', 'pause_at', float(moment))
+        if not accepted:
+            raise RunError(f'sim_node: {answer}')
+        if moment < NEVER:
+            self.expect(f'simulated time {moment:g} s',
+                        lambda: self._clock - self._epoch > moment - 1e-3, moment + PAUSE_TIMEOUT)
 
     def call(self, name: str, timeout: float = 2.0) -> tuple[bool, str]:
         """Call a service of the supervisor; return (accepted, answer)."""

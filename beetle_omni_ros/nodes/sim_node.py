@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+import math
 import time
 
 from rosgraph_msgs.msg import Clock
@@ -28,7 +29,8 @@ EARLY = 0.3             # part of a tick that the timer may come before the tick
 SLEW = 0.01             # largest shift of a tick to a later time, in ticks
 # Simulated time waits for a node that is farther behind than in real time, where the newest sample
 # is one period old. It does not wait for a node that has stopped.
-LAG = 0.02              # s between the newest sample and the newest answered one
+LAG = 0.02              # s between the newest sample and the newest answered one, at most
+NEVER = 1e9             # s
 PATIENCE = 0.3          # s of steady time without an answer after which a node has stopped
 
 
@@ -45,6 +47,7 @@ class RealTimePacing:
 
     def __init__(self, tick: float, clock: Callable[[], float]):
         self._tick, self._clock = tick, clock
+        self.pause_at = math.inf    # real time does not stand still
         self.epoch: float | None = None
         self.ticks = self.lost_ticks = 0
 
@@ -71,19 +74,26 @@ class RealTimePacing:
 
 class SimulatedTimePacing:
     """
-    Ticks of simulated time: one each time the timer fires, none while a node is late.
+    Ticks of simulated time: one each time the timer fires, none while an answer is due.
 
+    An answer is due as long after the one before as that was after its predecessor, at most LAG.
     On a slow computer, time passes more slowly and no deadline is missed. For a node that has
-    stopped, simulated time waits once. ``epoch`` is the time of the stamps at which simulated time
-    is zero, ``sent`` the stamp of the newest published sample.
+    stopped, simulated time waits once.
+
+    Attributes:
+        epoch: time of the stamps at which simulated time is zero, a whole second [s].
+        sent: stamp of the newest published sample [s].
+        pause_at: simulated time since the start at which it stands still [s].
+
     """
 
     lost_ticks = 0
 
     def __init__(self, tick: float, epoch: float, steady: Callable[[], float] = time.monotonic):
-        self._tick, self.epoch, self._steady = tick, epoch, steady
-        self.sent, self.ticks = float('-inf'), 0
-        self._answers: dict[str, tuple[float, float]] = {}
+        self._tick, self.epoch, self._steady = tick, math.floor(epoch), steady
+        self.sent, self.ticks, self.pause_at = float('-inf'), 0, math.inf
+        # topic -> stamp of its newest answer, its interval, steady time of its arrival [s]
+        self._answers: dict[str, tuple[float, float, float]] = {}
 
     @property
     def now(self) -> float:
@@ -92,13 +102,16 @@ class SimulatedTimePacing:
 
     def answered(self, name: str, stamp: float) -> None:
         """Record that ``name`` has answered the sample with this stamp."""
-        self._answers[name] = (stamp, self._steady())
+        before = self._answers.get(name, (-math.inf, 0.0, 0.0))[0]
+        interval = stamp - before if 0 < stamp - before < LAG else LAG
+        self._answers[name] = (stamp, interval, self._steady())
 
     def due(self) -> int:
         """Return the number of ticks that are due now: 1 or 0."""
-        now = self._steady()
-        if any(self.sent - stamp > LAG and now - arrived < PATIENCE
-               for stamp, arrived in self._answers.values()):
+        now, half = self._steady(), 0.5 * self._tick
+        if self.ticks * self._tick > self.pause_at - half or any(
+                self.sent - stamp > interval - half and now - arrived < PATIENCE
+                for stamp, interval, arrived in self._answers.values()):
             return 0
         self.ticks += 1
         return 1
@@ -124,9 +137,13 @@ class SimNodeParameters:
     clock: str = parameter('system', choices=('system', 'simulated'),
                            doc='real time, or simulated time on /clock, which waits for late '
                            'nodes; all other nodes then need use_sim_time')
+    pause_at: float = parameter(NEVER, doc='simulated time since the start at which it stands '
+                                'still, with clock simulated', unit='s', low=0)
     payload: float = parameter(0.0, doc='mass attached below the body', unit='kg', low=0, high=2)
     faults: str = parameter('', doc='active faults, as "rotor_stops rotor=2; mocap_lost '
                             'duration=3"; docs/faults.md lists the kinds')
+    task_faults: str = parameter('', doc='faults, as faults, that begin with the task of '
+                                 'reference_node')
     servo_faults: ServoFaults = group(ServoFaults, 'faults of the servo bus')
     board_faults: BoardFaults = group(BoardFaults, 'faults of the motor board')
 
@@ -144,8 +161,9 @@ class SimNode(FlightNode):
     def __init__(self):
         self._devices: EmulatedActuators | None = None
         self._clock_publisher = None
+        self._task_waits = True
         super().__init__('sim_node', SimNodeParameters, on_change=self._changed, changeable=(
-            'payload', 'faults', 'servo_faults.', 'board_faults.'))
+            'payload', 'pause_at', 'faults', 'servo_faults.', 'board_faults.'))
         given, robot = self.parameters, self.robot
         self._simulator = Simulator(
             robot, SimulatorParameters.load(given.simulator_file or None),
@@ -157,6 +175,9 @@ class SimNode(FlightNode):
         component = SimulatedRobot(self._simulator, robot, self._devices)
         component.report('pacing', self._pacing_status)
         component.every(self._simulator.tick, self._on_timer, steady=True)
+        if given.task_faults:
+            self._check_faults(parse_faults(given.task_faults))
+            component.follows('reference/state', self._on_task)
         if given.clock == 'simulated':
             component.on_answer = self._pacing.answered
             component.reads('odom', lambda odom: self._pacing.answered('odom', odom.stamp))
@@ -191,12 +212,7 @@ class SimNode(FlightNode):
 
     def _changed(self, new):
         """Set faults and payload; unchanged faults continue."""
-        faults, devices = parse_faults(new.faults), self._devices
-        for fault in faults:
-            if devices is not None and fault.changes(*DEVICES):
-                raise ParameterError(f"faults: '{fault.kind}': the emulated devices handle this "
-                                     'signal; use servo_faults and board_faults, or '
-                                     'actuators:=direct')
+        faults, devices = self._check_faults(parse_faults(new.faults)), self._devices
         of_devices = [*switched_on(new.servo_faults), *switched_on(new.board_faults)]
         if devices is not None:
             devices.set_faults(new.servo_faults, new.board_faults)
@@ -205,9 +221,24 @@ class SimNode(FlightNode):
                                  'devices with actuators direct; start with actuators:=emulated')
         self._simulator.set_faults(faults)
         self._simulator.payload = new.payload
+        self._pacing.pause_at = new.pause_at
         if new is not self.parameters:
             active = '; '.join(filter(None, (new.faults, *of_devices)))
             self.get_logger().info(f"faults: {active or 'none'}, payload {new.payload:g} kg")
+
+    def _check_faults(self, faults):
+        for fault in faults:
+            if self._devices is not None and fault.changes(*DEVICES):
+                raise ParameterError(f"faults: '{fault.kind}': the emulated devices handle this "
+                                     'signal; use servo_faults and board_faults, or '
+                                     'actuators:=direct')
+        return faults
+
+    def _on_task(self, state):
+        """Start the faults of the task when the task begins."""
+        if self._task_waits and state.startswith('flying'):
+            self._simulator.set_faults(parse_faults(self.parameters.task_faults))
+        self._task_waits = state == 'waiting'
 
     def _on_timer(self):
         component, pacing = self.component, self._pacing
@@ -220,7 +251,7 @@ class SimNode(FlightNode):
                 return
             if self._clock_publisher is not None:
                 message = Clock()
-                set_time(message.clock, pacing.now)
+                set_time(message.clock, round(pacing.now, 6))   # a tick is whole microseconds
                 self._clock_publisher.publish(message)
                 if frame.imu is not None:
                     pacing.sent = pacing.epoch + frame.imu.stamp

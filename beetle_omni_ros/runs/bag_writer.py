@@ -99,7 +99,7 @@ class BagWriter(Recorder, AbstractContextManager):
     """
 
     def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
-                 topics: Sequence[str] = tuple(TOPICS), frames: bool = False, epoch: int = 0):
+                 topics: Sequence[str] = tuple(TOPICS), frames: bool = False):
         """
         Create the folder and the bag in it.
 
@@ -109,7 +109,6 @@ class BagWriter(Recorder, AbstractContextManager):
             namespace: namespace of the topics, '' or e.g. '/robot1'.
             topics: names to declare, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
             frames: whether the description and the frames of the robot are recorded.
-            epoch: UNIX time of time 0 [s], so that a flight that begins at 0 s gets a real date.
 
         Raises:
             ParameterError: as of :func:`check_new`.
@@ -117,7 +116,6 @@ class BagWriter(Recorder, AbstractContextManager):
         """
         self.path = Path(path)
         self.meta = dict(meta or {})
-        self._epoch = int(epoch)
         self._connections: dict[str, Connection] = {}
         self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
         check_new(self.path)
@@ -158,8 +156,6 @@ class BagWriter(Recorder, AbstractContextManager):
         if received is None:
             received = value[0].t if isinstance(value, list) else value.stamp
         message = entry.write(value)
-        if self._epoch and hasattr(message, 'header'):
-            message.header.stamp.sec += self._epoch
         self.write_raw(name, entry.type, to_bytes(message, entry.type), received)
 
     def write_raw(self, topic: str, msgtype: str, data: bytes | memoryview, t: float) -> None:
@@ -170,7 +166,7 @@ class BagWriter(Recorder, AbstractContextManager):
             topic: full name.
             msgtype: ROS type such as 'sensor_msgs/msg/Imu'; one of Jazzy's common types.
             data: CDR.
-            t: time of recording since ``epoch`` [s].
+            t: time of recording [s].
 
         Raises:
             RunError: the file cannot be written.
@@ -181,8 +177,7 @@ class BagWriter(Recorder, AbstractContextManager):
             ours = ALL.get(topic.removeprefix(self._prefix))
             connection = self._declare(topic, msgtype, ours.qos if ours else EVENT)
         with self._disk():
-            self._writer.write(connection, max(0, nanoseconds(t)) + self._epoch * 1_000_000_000,
-                               data)
+            self._writer.write(connection, max(0, nanoseconds(t)), data)
         if self._frames is not None:
             self._frames.take(topic, data, t)
 

@@ -1,9 +1,9 @@
 """
 One flight as numpy arrays, its recording, and the motion and errors in it.
 
-Times are float seconds on the flight's clock: ROS time in the graph, from 0 in the in-process
-loop. A loop records into memory (:class:`LogRecorder`), onto disk
-(:class:`~beetle_omni_ros.runs.bag_writer.BagWriter`), or both (:class:`Recorder`).
+Times are float seconds on the flight's clock, ROS time in the graph. A loop records into memory
+(:class:`LogRecorder`), onto disk (:class:`~beetle_omni_ros.runs.bag_writer.BagWriter`), or both
+(:class:`Recorder`).
 """
 
 from __future__ import annotations

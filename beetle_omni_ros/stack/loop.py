@@ -37,10 +37,13 @@ from beetle_omni_ros.stack.reference import DONE, Reference, WAITING
 from beetle_omni_ros.stack.simulated import SimulatedRobot
 from beetle_omni_ros.stack.supervision import SupervisorComponent
 
-START_TIMEOUT = 5.0      # [s] for the estimator; noisy poses can need longer than SETTLE_TIME
+START_TIMEOUT = 5.0      # [s] for the estimator; noisy poses can need longer than ARMING_TIME
 TAKEOFF_TIMEOUT = 30.0   # [s] simulated time for the take-off
-SETTLE_TIME = 0.5        # [s] on the ground before arming, for the start of the estimator
+ARMING_TIME = 0.5        # [s] on the ground before arming, for the start of the estimator
 SWAP_CHARGE = 0.3        # [-] charge below which the pack is replaced at the next target
+# [s] time of the stamps at the start. Every whole second from 2004 to 2038 rounds the floats of
+# stamps equally, so that the digits of a flight do not depend on its date.
+EPOCH = 2 ** 30
 QUEUE = 10      # messages of a topic that wait for a process; older ones are dropped, as in ROS
 ROUNDING = 1e-9     # [s]
 
@@ -65,7 +68,7 @@ class Loop:
     Host of components and a simulated robot, advanced tick by tick.
 
     ``through`` gets (topic, value) of each published message and returns the values that arrive.
-    A recorder gets all of them.
+    A recorder gets all of them. ``epoch`` is the time of the stamps at the start [s].
 
     Attributes:
         robot: the simulated robot.
@@ -77,9 +80,9 @@ class Loop:
 
     def __init__(self, robot: SimulatedRobot, components: Sequence[Component],
                  recorder: Recorder | None = None,
-                 through: Callable[[str, Any], list] | None = None):
+                 through: Callable[[str, Any], list] | None = None, epoch: int = EPOCH):
         self.robot, self.refusals = robot, []       # type: ignore[var-annotated]
-        robot.epoch = 0.0
+        robot.epoch = epoch
         self._recorder, self._through = recorder or Recorder(), through
         self._queue: deque[tuple[str, Any, str]] = deque()
         self._readers: dict[str, list[Component]] = defaultdict(list)
@@ -143,13 +146,14 @@ class Loop:
         """Advance the robot by one tick, call the timers, deliver all messages."""
         frame = self.robot.advance()
         self.before_messages()
+        self.deliver()
         now = self.elapsed() + ROUNDING
         for component, timer in self._timers:
             if self._due[id(timer)] <= now:
                 self._due[id(timer)] += timer.period
                 if component not in self._waiting:
                     timer.call()
-        self.deliver()
+                    self.deliver()
         self.robot.publish(frame)
         self.deliver()
 
@@ -198,17 +202,19 @@ class FlightLoop(Loop):
         seed: seed of the simulation.
         faults: faults of robot, devices and processes; ``at`` counts from the task's start.
         others: further components, for example an observer.
+        epoch: time of the stamps at the start of the simulation [s].
 
     Attributes:
         simulator, supervisor: parts of the loop.
         events: events of the supervisor, oldest first.
+        epoch: time of the stamps at the start of the simulation [s].
 
     """
 
     def __init__(self, robot: RobotParameters, plant: RobotParameters,
                  controllers: dict[str, Controller], recorder: Recorder, *,
                  conditions: str = 'nominal', seed: int = 0, faults: Sequence[Fault] = (),
-                 others: Sequence[Component] = ()):
+                 others: Sequence[Component] = (), epoch: int = EPOCH):
         self.simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions,
                                    seed=seed)
         self.events: list[Event] = []
@@ -220,12 +226,12 @@ class FlightLoop(Loop):
         self._controllers = {name: ControllerComponent(name, controller, robot)
                              for name, controller in controllers.items()}
         self._faults = ProcessFaults(self.simulator.tick)
-        self._given_faults = tuple(faults)
+        self._given_faults, self.epoch = tuple(faults), epoch
         self._before, self._crashed = '', False     # state of the supervisor
         super().__init__(
             SimulatedRobot(self.simulator, plant),
             [self._estimator, *self._controllers.values(), self._supervision, *others], recorder,
-            self._through_faults if faults else None)
+            self._through_faults if faults else None, epoch)
         self.deliver()
 
     def fly(self, task: Task, progress: Callable[..., None] | None = None) -> bool:
@@ -275,7 +281,7 @@ class FlightLoop(Loop):
             RunError: no take-off.
 
         """
-        asked, supervisor, ekf = False, self.supervisor, self._estimator.ekf
+        asked, supervisor = False, self.supervisor
         while supervisor.state != 'flying':
             self.step()
             if error := self._controllers[supervisor.active].stepper.error:
@@ -286,8 +292,8 @@ class FlightLoop(Loop):
                     event.text for event in reversed(self.events)))
                 raise RunError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
                                f"'{supervisor.state}' ({'; '.join(events[2::-1])})")
-            if not asked and now >= SETTLE_TIME and (
-                    ekf.status == 'tracking' or now >= START_TIMEOUT):
+            if not asked and now >= ARMING_TIME - ROUNDING and (
+                    not supervisor.why_not_arm() or now >= START_TIMEOUT):
                 asked = True
                 answer = self.request('arm')
                 if not answer:
@@ -328,7 +334,7 @@ class FlightLoop(Loop):
         if faults.empty:
             return
         faults.update(self.simulator.time)
-        self.robot.epoch = faults.clock_step
+        self.robot.epoch = self.epoch + faults.clock_step
         for topic, value in faults.messages(self.supervisor.active, self.now()):
             self.deliver_later(topic, value)
         if faults.supervisor_waits:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+import math
 import secrets
 
 import numpy as np
@@ -11,11 +12,13 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Answer, Event
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.supervisor import DISARMED, FALLBACK, FLYING, STOPPED, Supervisor
+from beetle_omni_ros.safety.supervisor import FALLBACK, FLYING, STOPPED, Supervisor
 from beetle_omni_ros.stack.component import Component, ERROR, IDENTITY, OK, WARN
 from beetle_omni_ros.stack.estimator import SENSOR_AGE
 
-WATCH_PERIOD = 0.01     # [s] between checks for silent inputs
+# [s] between checks while no estimate comes, and without one until they begin. Otherwise the
+# estimate triggers them, every 5 ms, so that they do not depend on the phase of a timer.
+WATCH_PERIOD, WATCH_AFTER = 0.01, 0.015
 REQUESTS = ('arm', 'disarm', 'land', 'emergency_stop')
 BRIDGES = ('joint', 'rotor')
 
@@ -36,6 +39,7 @@ class SupervisorComponent(Component):
                                                   controllers)
         self._joints = None
         self._sent = (None, '')     # stamp and source of the last command
+        self._estimated = -math.inf     # time of the last step with an estimate [s]
         self._identity_sent = f'supervisor_node:{secrets.token_hex(4)}'     # of this run
         self.writes('command', IDENTITY, 'supervisor/state', 'supervisor/target',
                     'supervisor/actuators')
@@ -55,7 +59,7 @@ class SupervisorComponent(Component):
         for name in REQUESTS:
             self.services[name] = partial(self.request, name)
         self.report('supervisor', self._supervisor_status)
-        self.every(WATCH_PERIOD, self.step)
+        self.every(WATCH_PERIOD, self._watch)
 
     def start(self) -> None:
         """Publish identity and state."""
@@ -83,9 +87,13 @@ class SupervisorComponent(Component):
     def _on_odom(self, odom):
         if self._joints is None:
             return
-        self.supervisor.on_state(State.join(odom, self._joints), self.host.now())
-        if self.supervisor.state not in (DISARMED, FLYING):
-            self.step()     # the fallback controller answers each estimate
+        self._estimated = self.host.now()
+        self.supervisor.on_state(State.join(odom, self._joints), self._estimated)
+        self.step()
+
+    def _watch(self):
+        if not 0 <= self.host.now() - self._estimated < WATCH_AFTER:
+            self.step()
 
     def _on_command(self, name, command):
         supervisor = self.supervisor

@@ -163,7 +163,7 @@ def test_a_fall_in_the_landing_is_the_last_line_with_its_likely_cause(tmp_path, 
     bag = tmp_path / 'bag'
 
     def flown(graph, controller, task, *_):
-        with BagWriter(bag, epoch=1_700_000_000) as writer:
+        with BagWriter(bag) as writer:
             fly(writer, task)
             for t in np.arange(10, 11, 0.005):
                 write_truth(writer, t, np.array([0, 0, 0.15]), np.array([0, 0, 0, 1.0]),
