@@ -31,6 +31,7 @@ from beetle_omni_ros.robot.schema import ParameterError, RunError
 SLOWEST = 20.0
 ARM_TIMEOUT = 10.0      # s
 PAUSE_TIMEOUT = 10.0    # s
+PAUSE_SETTLE = 0.05     # s until the nodes have answered the last sample before a pause
 TAKEOFF_TIMEOUT = 30.0  # s
 TAKEOFF_ATTEMPTS = 3
 SETTLE_TIME = 1.0       # s before arming, in which start-up work ends
@@ -212,6 +213,7 @@ class Operator(Client):
         if moment < NEVER:
             self.expect(f'simulated time {moment:g} s',
                         lambda: self._clock - self._epoch > moment - 1e-3, moment + PAUSE_TIMEOUT)
+            self.spin(PAUSE_SETTLE)
 
     def call(self, name: str, timeout: float = 2.0) -> tuple[bool, str]:
         """Call a service of the supervisor; return (accepted, answer)."""

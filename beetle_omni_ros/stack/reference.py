@@ -11,8 +11,6 @@ from beetle_omni_ros.runs.tasks import Task, TaskPlayer, WITH_WRENCHES
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.stack.component import Component, OK
 
-PERIOD = 0.02           # [s] between updates of the task
-IMPULSE_PERIOD = 0.005  # [s] the same for tasks with impulses of 50 ms
 # A trajectory is published in overlapping windows: a reader would need tenths of a second to
 # decode the whole of it, and a node that starts late soon receives the next window.
 WINDOW, WINDOW_PERIOD = 3.0, 1.5    # [s]
@@ -23,6 +21,9 @@ WAITING, DONE, ABORTED = 'waiting', 'done', 'aborted'
 class Reference(Component):
     """
     Publishes the targets of a task, beginning when the supervisor reports 'flying'.
+
+    Each command lets the task proceed, so that a target comes after the controllers' step and
+    before the next one, in any host.
 
     ``reference/state`` (latched) is 'waiting', 'flying 3/15', 'done',
     'done: control lost at level 60', or 'aborted' if the flight ended before the task.
@@ -36,11 +37,10 @@ class Reference(Component):
         self._window_end = 0.0
         self.writes('target_pose', 'target_trajectory', 'disturbance', STATE)
         self.follows('supervisor/state', self._on_supervisor)
-        disturbed = task.kind in WITH_WRENCHES
-        if disturbed:       # the loss of control ends tasks with rising levels
+        if task.kind in WITH_WRENCHES:      # the loss of control ends tasks with rising levels
             self.reads('odom', self._on_odom, qos=SENSOR)
+        self.reads('command', self._on_command, expected=False)
         self.report('task', lambda: (OK, self.state, {'task': task.name}))
-        self.every(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer)
 
     def start(self) -> None:
         """Publish the state."""
@@ -62,10 +62,11 @@ class Reference(Component):
             self._player = None
             self.update(STATE, ABORTED)
 
-    def _on_timer(self):
-        if self._player is None:
+    def _on_command(self, command):
+        player = self._player
+        if player is None or command.stamp <= player.start:     # of the take-off
             return
-        now, player = self.host.now(), self._player
+        now = self.host.now()
         over = player.update(now, *((self._odom.position, self._odom.quaternion)
                                     if self._odom else ()))
         target, segment = player.target, player.segment
@@ -94,7 +95,8 @@ class Reference(Component):
         """Publish the trajectory's own points from now on, so that no reader sees it changed."""
         path = self._trajectory
         last = len(path.times) - 1
-        begin = min(max(int(np.searchsorted(path.times, now, 'right')) - 1, 0), last - 1)
+        # One point before the present one, because a trajectory rests up to its first point.
+        begin = min(max(int(np.searchsorted(path.times, now, 'right')) - 2, 0), last - 1)
         end = min(max(int(np.searchsorted(path.times, path.times[begin] + WINDOW)), begin + 1),
                   last)
         part = slice(begin, end + 1)
