@@ -93,8 +93,8 @@ class FlightNode(Node):
         except MessageError as error:
             component.reject(topic, str(error), error.kind)
             return
-        component.feed(topic, value, published=published,
-                       source=message.header.frame_id if topic == 'command' else '')
+        component.feed(topic, value, message.header.frame_id if topic == 'command' else '',
+                       published)
 
     # Host of the component --------------------------------------------------------------------
 

@@ -243,7 +243,7 @@ class SimNode(FlightNode):
     def _on_timer(self):
         component, pacing = self.component, self._pacing
         for _ in range(pacing.due()):
-            component.epoch = pacing.epoch
+            self._simulator.epoch = pacing.epoch
             try:
                 frame = component.advance()
             except RunError as error:
@@ -254,7 +254,7 @@ class SimNode(FlightNode):
                 set_time(message.clock, round(pacing.now, 6))   # a tick is whole microseconds
                 self._clock_publisher.publish(message)
                 if frame.imu is not None:
-                    pacing.sent = pacing.epoch + frame.imu.stamp
+                    pacing.sent = frame.imu.stamp
             component.publish(frame)
 
     def _pacing_status(self):

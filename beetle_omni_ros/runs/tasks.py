@@ -159,7 +159,7 @@ class TaskPlayer:
     that the 8 s of a pose are exact.
 
     Attributes:
-        segment: the present one.
+        segment, index: the present one, and its number from 0.
         changed: whether it began with the last call.
         target: to publish now, or None.
         lost_level: level at which control was lost, which ends the task, or None.
@@ -174,7 +174,7 @@ class TaskPlayer:
         self.lost_level: float | None = None
         self._segments = (*task.segments, self.segment)     # after the task
         self._ends = task.ends.tolist()
-        self._index = -1
+        self.index = -1
         self._in_force: Target | None = None
 
     def update(self, now: float, position: np.ndarray | None = None,
@@ -185,19 +185,19 @@ class TaskPlayer:
         Pose (3,) in world [m] and (4,) of the robot serve to detect a loss of control.
         """
         index = bisect_right(self._ends, now - self.start + 1e-6)
-        level = self._segments[self._index].level
+        level = self._segments[self.index].level
         if position is not None and level and self.task.kind in ('force', 'torque') \
                 and control_lost(self._in_force, position, quaternion if
                                  self._segments[index].level != level else None):
             self.lost_level = level
         if self.lost_level is not None:
             index = len(self._ends)
-        self.target, self.changed = None, index != self._index
-        for k in range(self._index + 1, index + 1):
+        self.target, self.changed = None, index != self.index
+        for k in range(self.index + 1, index + 1):
             if build := self._segments[k].target:
                 due = float(self.start + (self._ends[k - 1] if k else 0))
                 self.target = self._in_force = build(due)
-        self._index, self.segment = index, self._segments[index]
+        self.index, self.segment = index, self._segments[index]
         return index == len(self._ends)
 
 

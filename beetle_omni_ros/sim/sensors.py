@@ -140,15 +140,14 @@ class Sensors:
         A MEMS IMU samples at several kHz and filters before it decimates to 200 Hz. A sample of
         one instant would alias the fast accelerations of a tilting module into velocity errors.
         """
-        dt = after.stamp - before.stamp
         x, y, z, w = own = before.quaternion.tolist()
         turn = rotations.log(rotations.product(-x, -y, -z, w, *after.quaternion.tolist()))
         middle = rotations.product(*own, *rotations.exp_parts(*(0.5 * turn).tolist()))
-        acceleration = (after.velocity - before.velocity) / dt
+        acceleration = (after.velocity - before.velocity) / self._tick
         acceleration[2] += self._gravity
         motion = np.empty(6)
         motion[:3] = acceleration.dot(rotations.matrix(middle))
-        motion[3:] = rate = turn / dt
+        motion[3:] = rate = turn / self._tick
         if (arm := self._lever_arm) is not None:
             turning = (after.angular_velocity - before.angular_velocity) / self._tick
             motion[:3] += np.cross(turning, arm) + np.cross(rate, np.cross(rate, arm))

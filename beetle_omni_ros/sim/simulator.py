@@ -130,7 +130,8 @@ class Simulator:
     Plant, actuator timing, battery and sensors of the true robot, advanced tick by tick.
 
     Equal robots, parameters, conditions ('nominal' or 'published'), seeds and calls give equal
-    results. ``time`` is that since reset [s], ``tick`` the duration of one step [s]. The reset of
+    results. ``time`` is that since reset [s], ``tick`` the duration of one step [s], ``epoch`` the
+    time of the stamps at reset [s], which may change like a clock that is set. The reset of
     ``battery`` inserts a new one, also in flight. In flight ``wrench`` may be set, an external
     force in world [N] and torque in base_link [N m] there (6,), and ``payload``, the mass [kg] of
     a ball that is fixed below the body. ``link`` has the present targets of the actuators.
@@ -142,8 +143,8 @@ class Simulator:
     """
 
     def __init__(self, robot: RobotParameters, parameters: SimulatorParameters | None = None,
-                 conditions: str = 'nominal', seed: int = 0):
-        self._robot = robot
+                 conditions: str = 'nominal', seed: int = 0, epoch: float = 0.0):
+        self._robot, self.epoch = robot, epoch
         self._parameters = parameters or SimulatorParameters.load()
         self._seed = seed
         self.tick = self._parameters.tick
@@ -275,5 +276,6 @@ class Simulator:
 
     def _truth(self):
         qpos, qvel = self._plant.state
-        return Truth(self.time, qpos[:3], qvel[:3], qpos[XYZW], qvel[3:6], self._plant.tilt,
-                     qvel[6:], self._plant.thrust, self._plant.contact, self._impact, self._broken)
+        return Truth(self.epoch + self.time, qpos[:3], qvel[:3], qpos[XYZW], qvel[3:6],
+                     self._plant.tilt, qvel[6:], self._plant.thrust, self._plant.contact,
+                     self._impact, self._broken)

@@ -8,7 +8,6 @@ one process (:mod:`.loop`) and a ROS node (:class:`beetle_omni_ros.nodes.node.Fl
 
 from __future__ import annotations
 
-from bisect import bisect
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -34,24 +33,42 @@ TEXT_LIMIT = 40         # characters of a foreign identity in an error message
 class Distribution:
     """Quantiles of durations in constant memory: a histogram with 2 % wide bins."""
 
-    EDGES = tuple(1e-6 * 1.02 ** k for k in range(1000))    # [s], up to 400 s
+    EDGES = 1e-6 * 1.02 ** np.arange(1000)      # [s], up to 400 s
+    PENDING = 1000      # durations that wait to be counted together, which is faster
 
     def __init__(self):
-        self.counts = np.zeros(len(self.EDGES) + 1, dtype=np.int64)
-        self.count, self.max = 0, 0.0
+        self._counts = np.zeros(len(self.EDGES) + 1, dtype=np.int64)
+        self._max, self._pending = 0.0, []
 
     def add(self, seconds: float) -> None:
         """Count one duration [s]."""
-        self.counts[bisect(self.EDGES, seconds)] += 1
-        self.count += 1
-        self.max = max(self.max, seconds)
+        self._pending.append(seconds)
+        if len(self._pending) == self.PENDING:
+            self._count()
+
+    def _count(self):
+        if self._pending:
+            np.add.at(self._counts, np.searchsorted(self.EDGES, self._pending, 'right'), 1)
+            self._max = max(self._max, *self._pending)
+            self._pending.clear()
+
+    @property
+    def count(self) -> int:
+        """Number of durations."""
+        return int(self._counts.sum()) + len(self._pending)
+
+    @property
+    def max(self) -> float:
+        """Longest duration [s]; 0 without one."""
+        return max([self._max, *self._pending])
 
     def quantile(self, fraction: float) -> float:
         """Return a quantile [s], up to 2 % too large; NaN if nothing was counted."""
+        self._count()
         if not self.count:
             return float('nan')
-        k = int(np.searchsorted(np.cumsum(self.counts), fraction * self.count))
-        return min((*self.EDGES, self.max)[k], self.max)
+        k = int(np.searchsorted(np.cumsum(self._counts), fraction * self.count))
+        return float(min(self.EDGES[k] if k < len(self.EDGES) else self._max, self._max))
 
     def status(self, text: str, level: int = OK, **more: float) -> tuple[int, str, dict]:
         """Return median, 99th percentile, maximum [ms] and number as a diagnostic status."""
@@ -206,29 +223,29 @@ class Component:
 
     # Messages ---------------------------------------------------------------------------------
 
-    def feed(self, topic: str, value: Any, *, published: float | None = None,
-             source: str = '') -> None:
+    def feed(self, topic: str, value: Any, source: str = '',
+             published: float | None = None) -> None:
         """
         Receive one message, or refuse it, which is counted and logged.
 
         Args:
             topic: one of ``inputs``.
             value: value of the topic's class.
+            source: frame_id of a command: the identity of its supervisor.
             published: time of publication [s], system time, nan if unknown; given for targets
                 and passed to their handle.
-            source: frame_id of a command: the identity of its supervisor.
 
         """
         entry = self.inputs[topic]
         if not entry.stamped:
             entry.handle(value)
             return
-        host = self.host
+        host, limit = self.host, entry.max_age
         age = host.now() - value.stamp
         try:
-            if topic == 'command':
+            if self._identity and topic == 'command':
                 self._check_source(source)
-            if entry.max_age is not None and not -FUTURE <= age <= entry.max_age:
+            if limit is not None and not -FUTURE <= age <= limit:
                 raise MessageError('stale stamp' if age > 0 else 'stamp in the future')
             if published is None:
                 entry.handle(value)
@@ -264,7 +281,7 @@ class Component:
         those with the newest identity.
         """
         identity = self._identity
-        if identity and source != identity:
+        if source != identity:
             name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'
             raise MessageError(
                 f"2nd publisher: frame_id has {name}, expected '{identity[:TEXT_LIMIT]}'",

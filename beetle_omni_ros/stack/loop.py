@@ -82,12 +82,15 @@ class Loop:
                  recorder: Recorder | None = None,
                  through: Callable[[str, Any], list] | None = None, epoch: int = EPOCH):
         self.robot, self.refusals = robot, []       # type: ignore[var-annotated]
-        robot.epoch = epoch
+        robot.simulator.epoch = epoch
+        self._elapsed = robot.simulator.time
+        self._now = epoch + self._elapsed
         self._recorder, self._through = recorder or Recorder(), through
         self._queue: deque[tuple[str, Any, str]] = deque()
         self._readers: dict[str, list[Component]] = defaultdict(list)
         self._timers: list[tuple[Component, Timer]] = []
         self._due: dict[int, float] = {}    # id of a timer -> time of its next call [s]
+        self._next_due = math.inf
         # component that is not scheduled -> topic -> newest messages
         self._waiting: dict[Component, dict[str, deque]] = {}
         for component in (*components, robot):
@@ -105,7 +108,8 @@ class Loop:
         component.attach(self)
 
     def _restart(self, timer):
-        self._due[id(timer)] = self.elapsed() + timer.period
+        self._due[id(timer)] = due = self.elapsed() + timer.period
+        self._next_due = min(self._next_due, due)
 
     def _report(self, component):
         self.publish('diagnostics', component.diagnostics())
@@ -114,11 +118,11 @@ class Loop:
 
     def now(self) -> float:
         """Time on the flight computer's clock [s]."""
-        return self.robot.simulator.time + self.robot.epoch
+        return self._now
 
     def elapsed(self) -> float:
         """Simulated time [s]."""
-        return self.robot.simulator.time
+        return self._elapsed
 
     def publish(self, topic: str, value: Any, source: str = '') -> None:
         """Queue a message."""
@@ -144,18 +148,24 @@ class Loop:
 
     def step(self) -> None:
         """Advance the robot by one tick, call the timers, deliver all messages."""
-        frame = self.robot.advance()
+        frame, simulator = self.robot.advance(), self.robot.simulator
+        self._elapsed = simulator.time
+        self._now = simulator.epoch + simulator.time
         self.before_messages()
         self.deliver()
-        now = self.elapsed() + ROUNDING
+        if simulator.time + ROUNDING >= self._next_due:
+            self._call_timers(simulator.time + ROUNDING)
+        self.robot.publish(frame)
+        self.deliver()
+
+    def _call_timers(self, now):
         for component, timer in self._timers:
             if self._due[id(timer)] <= now:
                 self._due[id(timer)] += timer.period
                 if component not in self._waiting:
                     timer.call()
                     self.deliver()
-        self.robot.publish(frame)
-        self.deliver()
+        self._next_due = min(self._due.values())
 
     def before_messages(self) -> None:
         """Hook after the robot's tick; overridden by subclasses."""
@@ -165,18 +175,13 @@ class Loop:
         queue, write, waiting = self._queue, self._recorder.write, self._waiting
         while queue:
             topic, value, source = queue.popleft()
-            write(topic, value, self.now())
+            write(topic, value, self._now)
+            published = math.nan if topic in TARGETS else None
             for component in self._readers.get(topic, ()):
                 if component in waiting:
-                    waiting[component][topic].append((value, source))
+                    waiting[component][topic].append((value, source, published))
                 else:
-                    self._feed(component, topic, value, source)
-
-    def _feed(self, component, topic, value, source):
-        if topic in TARGETS:
-            component.feed(topic, value, published=math.nan)
-        else:
-            component.feed(topic, value, source=source)
+                    component.feed(topic, value, source, published)
 
     def suspend(self, component: Component) -> None:
         """Do not schedule a component; its newest messages wait."""
@@ -185,8 +190,8 @@ class Loop:
     def resume(self, component: Component) -> None:
         """Schedule a component again; it first gets the messages that waited."""
         for topic, messages in self._waiting.pop(component, {}).items():
-            for value, source in messages:
-                self._feed(component, topic, value, source)
+            for message, source, published in messages:
+                component.feed(topic, message, source, published)
 
 
 class FlightLoop(Loop):
@@ -216,7 +221,7 @@ class FlightLoop(Loop):
                  conditions: str = 'nominal', seed: int = 0, faults: Sequence[Fault] = (),
                  others: Sequence[Component] = (), epoch: int = EPOCH):
         self.simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions,
-                                   seed=seed)
+                                   seed=seed, epoch=epoch)
         self.events: list[Event] = []
         parameters = replace(SupervisorParameters.load(), controller=next(iter(controllers)))
         self._supervision = SupervisorComponent(parameters, robot, tuple(controllers),
@@ -334,7 +339,8 @@ class FlightLoop(Loop):
         if faults.empty:
             return
         faults.update(self.simulator.time)
-        self.robot.epoch = self.epoch + faults.clock_step
+        self.simulator.epoch = self.epoch + faults.clock_step
+        self._now = self.simulator.epoch + self.simulator.time
         for topic, value in faults.messages(self.supervisor.active, self.now()):
             self.deliver_later(topic, value)
         if faults.supervisor_waits:

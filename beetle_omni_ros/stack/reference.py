@@ -87,9 +87,8 @@ class Reference(Component):
             self._player = self._trajectory = None
             self.update(STATE, f'{DONE}{lost}')
         else:
-            ends = self._task.ends
-            current = 1 + int(np.searchsorted(ends, now - player.start, 'right'))
-            self.update(STATE, f'flying {min(current, len(ends))}/{len(ends)}')
+            count = len(self._task.ends)
+            self.update(STATE, f'flying {min(player.index + 1, count)}/{count}')
 
     def _publish_window(self, now):
         """Publish the trajectory's own points from now on, so that no reader sees it changed."""

@@ -25,7 +25,7 @@ class SimulatedRobot(Component):
     Steps the simulator; commands come from the topic, or through emulated ``devices``.
 
     Attributes:
-        epoch: time of the stamps at which simulated time is zero [s]; None before the start.
+        simulator: its ``epoch`` is the time of the stamps at which simulated time is zero.
         on_answer: called with 'command' and the stamp of each command.
 
     """
@@ -34,7 +34,6 @@ class SimulatedRobot(Component):
                  devices: EmulatedActuators | None = None):
         super().__init__('sim_node')
         self.simulator = simulator
-        self.epoch: float | None = None
         self.on_answer: Callable[[str, float], None] = lambda topic, stamp: None
         self._devices, self._latency = devices, Distribution()
         lift = HOPELESS * 4 * robot.rotors.thrust_max
@@ -58,21 +57,17 @@ class SimulatedRobot(Component):
 
     def publish(self, frame: Frame) -> None:
         """Publish readings and truth."""
-        epoch = self.epoch
         for name, topic in self._sensors.items():
             reading = getattr(frame, name)
             if reading is not None:
-                self.send(topic, replace(reading, stamp=epoch + reading.stamp)
-                          if epoch else reading)
-        self.send('ground_truth/odom', replace(frame.truth, stamp=epoch + frame.truth.stamp)
-                  if epoch else frame.truth)
+                self.send(topic, reading)
+        self.send('ground_truth/odom', frame.truth)
 
     def on_command(self, command):
         """Let the actuators follow a command."""
         self._latency.add(self.host.now() - command.stamp)
         self.on_answer('command', command.stamp)
-        if self.epoch is not None:
-            self.simulator.command(replace(command, stamp=command.stamp - self.epoch))
+        self.simulator.command(replace(command, stamp=command.stamp - self.simulator.epoch))
 
     def _on_disturbance(self, wrench):
         size, most = np.linalg.norm([wrench.force, wrench.torque], axis=1), self._most_wrench

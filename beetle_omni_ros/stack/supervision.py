@@ -16,8 +16,8 @@ from beetle_omni_ros.safety.supervisor import FALLBACK, FLYING, STOPPED, Supervi
 from beetle_omni_ros.stack.component import Component, ERROR, IDENTITY, OK, WARN
 from beetle_omni_ros.stack.estimator import SENSOR_AGE
 
-# [s] between checks while no estimate comes, and without one until they begin. Otherwise the
-# estimate triggers them, every 5 ms, so that they do not depend on the phase of a timer.
+# [s] between checks while nothing triggers a step, and without a trigger until they begin. The
+# triggers are commands in flight, otherwise estimates: steps do not depend on a timer's phase.
 WATCH_PERIOD, WATCH_AFTER = 0.01, 0.015
 REQUESTS = ('arm', 'disarm', 'land', 'emergency_stop')
 BRIDGES = ('joint', 'rotor')
@@ -39,7 +39,7 @@ class SupervisorComponent(Component):
                                                   controllers)
         self._joints = None
         self._sent = (None, '')     # stamp and source of the last command
-        self._estimated = -math.inf     # time of the last step with an estimate [s]
+        self._triggered = -math.inf     # time of the last step by a message [s]
         self._identity_sent = f'supervisor_node:{secrets.token_hex(4)}'     # of this run
         self.writes('command', IDENTITY, 'supervisor/state', 'supervisor/target',
                     'supervisor/actuators')
@@ -87,19 +87,22 @@ class SupervisorComponent(Component):
     def _on_odom(self, odom):
         if self._joints is None:
             return
-        self._estimated = self.host.now()
-        self.supervisor.on_state(State.join(odom, self._joints), self._estimated)
-        self.step()
+        now = self.host.now()
+        self.supervisor.on_state(State.join(odom, self._joints), now)
+        if self.supervisor.state != FLYING:     # the fallback controller answers each estimate
+            self._triggered = now
+            self.step()
 
     def _watch(self):
-        if not 0 <= self.host.now() - self._estimated < WATCH_AFTER:
+        if not 0 <= self.host.now() - self._triggered < WATCH_AFTER:
             self.step()
 
     def _on_command(self, name, command):
-        supervisor = self.supervisor
-        accepted = supervisor.on_command(name, command, self.host.now())
+        supervisor, now = self.supervisor, self.host.now()
+        accepted = supervisor.on_command(name, command, now)
         if accepted and name == supervisor.active and supervisor.state == FLYING:
-            self.step()     # at once, not at the next timer
+            self._triggered = now
+            self.step()
 
     def _on_bridge(self, name, text):
         self.supervisor.on_actuators(name, text, self.host.now())
