@@ -110,6 +110,10 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
                  'New folder for the bag; with several controllers it contains one bag for '
                  'each.'))] = None,
              faults: FaultsOption = None,
+             actuators: Annotated[str, Option(
+                 callback=one_of, metavar='direct|emulated', help=(
+                     'direct: commands go straight to the simulated plant; emulated: through '
+                     'drivers, serial ports and emulated devices, in real time.'))] = 'direct',
              json_path: JsonOption = None):
     """
     Fly a task in one process, deterministic and without a clock.
@@ -134,7 +138,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
     from beetle_omni_ros.runs.metrics import failed
     results = run_evaluate(controllers=controllers, task=task, conditions=conditions, robot=robot,
                            plant=plant, seed=seed, bag=bag, json_path=json_path,
-                           faults=faults, options=options)
+                           faults=faults, actuators=actuators, options=options)
     return FAILED if any(map(failed, results.values())) else 0
 
 

@@ -32,7 +32,8 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         conditions: str = 'nominal', seed: int = 0,
         options: Mapping[str, ControllerOptions] = MappingProxyType({}),
         built: Controller | None = None, bag: Path | None = None, meta: dict | None = None,
-        faults: Sequence[Fault] = (), progress: Callable[..., None] | None = None) -> FlightLog:
+        faults: Sequence[Fault] = (), actuators: str = 'direct',
+        progress: Callable[..., None] | None = None) -> FlightLog:
     """
     Fly one task with one controller, a name or a reference to a class; ``built`` is that one.
 
@@ -57,8 +58,14 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
             from beetle_omni_ros.runs.bag_writer import BagWriter
             recorder = Recorder(memory, stack.enter_context(BagWriter(
                 bag, meta=meta, topics=tuple(topics_with([entry.name])), frames=True)))
-        FlightLoop(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
-                   faults=faults, epoch=int(time())).fly(task, progress)
+        kind: type[FlightLoop] = FlightLoop
+        if actuators == 'emulated':
+            from beetle_omni_ros.stack.real_time import EmulatedLoop  # has serial ports
+            kind = EmulatedLoop
+        flight = kind(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
+                      faults=faults, epoch=int(time()))
+        stack.callback(flight.close)
+        flight.fly(task, progress)
     return memory.log()
 
 
@@ -66,7 +73,8 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
                  robot: Path | None = None, plant: Path | None = None, seed: int = 0,
                  bag: Path | None = None, json_path: Path | None = None,
                  options: Mapping[str, ControllerOptions] = MappingProxyType({}),
-                 faults: Path | None = None, console: Console | None = None) -> dict:
+                 faults: Path | None = None, actuators: str = 'direct',
+                 console: Console | None = None) -> dict:
     """
     Fly a task with each controller and report; arguments as of `beetle_omni evaluate`.
 
@@ -86,7 +94,8 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
     injected = load_faults(faults) if faults else []
     meta = {'task': task.name, 'conditions': conditions, 'seed': seed,
             'robot': str(robot) if robot else 'params/robot.yaml',
-            'plant': str(plant) if plant else None, 'version': __version__}
+            'plant': str(plant) if plant else None, 'version': __version__,
+            **({'actuators': actuators} if actuators != 'direct' else {})}
     for given in options.values():
         if given.policy:
             meta['policy'] = str(given.policy)
@@ -113,7 +122,8 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             log = fly(entry.reference, task, robot=believed, plant=true, conditions=conditions,
                       seed=seed, options=options, built=controller,
                       bag=bag / name if bag and len(built) > 1 else bag, meta=meta,
-                      faults=injected, progress=lambda completed, bar=bar: bars.update(
+                      faults=injected, actuators=actuators,
+                      progress=lambda completed, bar=bar: bars.update(
                           bar, completed=completed) or interrupts)
             results[name] = metrics(log, task)
             if error := log.meta['controller_error']:

@@ -18,7 +18,7 @@ from typing import Any
 
 from beetle_omni_ros.control.base import Controller, MOTORS_OFF, PoseTarget, Target
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.messages.topics import TARGETS
+from beetle_omni_ros.messages.topics import ALL, TARGETS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs.log import Recorder
@@ -44,6 +44,7 @@ SWAP_CHARGE = 0.3        # [-] charge below which the pack is replaced at the ne
 # [s] time of the stamps at the start. Every whole second from 2004 to 2038 rounds the floats of
 # stamps equally, so that the digits of a flight do not depend on its date.
 EPOCH = 2 ** 30
+LATCHED_TOPICS = {topic.name for topic in ALL.values() if topic.qos.latched}
 QUEUE = 10      # messages of a topic that wait for a process; older ones are dropped, as in ROS
 ROUNDING = 1e-9     # [s]
 
@@ -91,6 +92,7 @@ class Loop:
         self._timers: list[tuple[Component, Timer]] = []
         self._due: dict[int, float] = {}    # id of a timer -> time of its next call [s]
         self._next_due = math.inf
+        self._latched: dict[str, Any] = {}      # newest values of latched topics
         # component that is not scheduled -> topic -> newest messages
         self._waiting: dict[Component, dict[str, deque]] = {}
         for component in (*components, robot):
@@ -106,6 +108,10 @@ class Loop:
             timer.reset = partial(self._restart, timer)
             timer.reset()
         component.attach(self)
+        for topic in component.inputs:
+            if topic in self._latched:
+                component.feed(topic, self._latched[topic], '',
+                               math.nan if topic in TARGETS else None)
 
     def _restart(self, timer):
         self._due[id(timer)] = due = self.elapsed() + timer.period
@@ -176,6 +182,8 @@ class Loop:
         while queue:
             topic, value, source = queue.popleft()
             write(topic, value, self._now)
+            if topic in LATCHED_TOPICS:
+                self._latched[topic] = value
             published = math.nan if topic in TARGETS else None
             for component in self._readers.get(topic, ()):
                 if component in waiting:
@@ -303,6 +311,9 @@ class FlightLoop(Loop):
                 answer = self.request('arm')
                 if not answer:
                     raise RunError(answer.text)
+
+    def close(self) -> None:
+        """Release what the flight used."""
 
     def request(self, name: str):
         """Call a service of the supervisor; returns its answer."""

@@ -35,21 +35,33 @@ class SimulatedRobot(Component):
         super().__init__('sim_node')
         self.simulator = simulator
         self.on_answer: Callable[[str, float], None] = lambda topic, stamp: None
-        self._devices, self._latency = devices, Distribution()
+        self._devices: EmulatedActuators | None = None
+        self._latency = Distribution()
         lift = HOPELESS * 4 * robot.rotors.thrust_max
         self._most_wrench = lift, lift * np.linalg.norm(robot.rotors.positions, axis=1).max()
-        self._sensors = {name: topic for name, topic in SENSORS.items()
-                         if devices is None or name not in OF_ACTUATORS}
-        self.writes(*self._sensors.values(), 'ground_truth/odom')
+        self._sensors = dict(SENSORS)
         if devices is None:
             self.reads('command', self.on_command, max_age=COMMAND_AGE)
             self.report('latency', lambda: self._latency.status(
                 'stamp of the answered IMU sample to the arrival of its command'))
         else:
-            self.report('devices', self._devices_status)
+            self.use(devices)
+        self.writes(*self._sensors.values(), 'ground_truth/odom')
         self.reads('disturbance', self._on_disturbance, expected=False)
         self.track_compute(simulator.tick)
         self.report('robot', self._robot_status)
+
+    def use(self, devices: EmulatedActuators) -> None:
+        """Let the plant follow emulated devices; the bridges then publish their readings."""
+        self._devices = devices
+        for name in OF_ACTUATORS:
+            del self._sensors[name]
+        self.report('devices', self._devices_status)
+
+    def close(self) -> None:
+        """Switch the devices off."""
+        if self._devices is not None:
+            self._devices.close()
 
     def advance(self) -> Frame:
         """Simulate one tick; return the readings that arrive in it."""
