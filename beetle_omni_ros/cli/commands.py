@@ -11,6 +11,7 @@ from typing import Annotated
 from typer import Argument, echo, Option, Typer
 
 from beetle_omni_ros.cli.options import (
+    ComponentOption,
     CONDITIONS,
     ConditionsOption,
     ControllerOption,
@@ -74,6 +75,7 @@ def fly(controller: ControllerOption = DEFAULT,
             'Run the other controllers on standby, to be selected in flight, or only the active '
             'controller.'))] = True,
         faults: FaultsOption = None,
+        components: ComponentOption = None,
         domain_id: DomainOption = None,
         view: Annotated[bool, Option('--view', help=(
             'Show the flight in the browser, as beetle_omni view does.'))] = False,
@@ -89,7 +91,7 @@ def fly(controller: ControllerOption = DEFAULT,
     if bag is None:
         bag = Path('runs_out') / f'fly_{datetime.now():%Y%m%d_%H%M%S}'
         echo(f'bag: {bag}')
-    return run_fly(**{**given, 'bag': bag})
+    return run_fly(**{**given, 'bag': bag, 'components': components or ()})
 
 
 @app.command()
@@ -114,6 +116,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
                  callback=one_of, metavar='direct|emulated', help=(
                      'direct: commands go straight to the simulated plant; emulated: through '
                      'drivers, serial ports and emulated devices, in real time.'))] = 'direct',
+             components: ComponentOption = None,
              json_path: JsonOption = None):
     """
     Fly a task in one process, deterministic and without a clock.
@@ -138,7 +141,8 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
     from beetle_omni_ros.runs.metrics import failed
     results = run_evaluate(controllers=controllers, task=task, conditions=conditions, robot=robot,
                            plant=plant, seed=seed, bag=bag, json_path=json_path,
-                           faults=faults, actuators=actuators, options=options)
+                           faults=faults, actuators=actuators, components=components or (),
+                           options=options)
     return FAILED if any(map(failed, results.values())) else 0
 
 

@@ -97,6 +97,9 @@ FaultsOption = Annotated[Path | None, Option(
     exists=True, dir_okay=False, metavar='FILE', help=(
         'Faults, all in one flight; their times count from the start of the task (YAML, see '
         'docs/faults.md).'))]
+ComponentOption = Annotated[str | None, Option(
+    '--component', callback=several, metavar='FILE.py:Class,...', help=(
+        'Further components beside the flight, see docs/how-to/own_component.md.'))]
 JobsOption = Annotated[int | None, Option(
     '--jobs', '-j', metavar='N', min=1, help='Parallel flights. Default: one on each core.')]
 OutputOption = Annotated[Path | None, Option(

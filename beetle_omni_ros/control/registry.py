@@ -187,6 +187,11 @@ def names() -> list[str]:
     return [*SHIPPED, *_ADDED]
 
 
+def snake_case(name: str) -> str:
+    """Small letters and _ of the name of a class."""
+    return re.sub(r'(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])', '_', name).lower()
+
+
 def entry_of(found: Any, spec: str) -> ControllerEntry:
     """
     Make an entry from a class, or a function that builds a controller; or a ParameterError.
@@ -196,8 +201,8 @@ def entry_of(found: Any, spec: str) -> ControllerEntry:
     if not callable(found):
         raise ParameterError(f"controller '{spec}': a {type(found).__name__}, expected a class "
                              'with step(state, target), reset() and period')
-    snake = re.sub(r'(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])', '_', found.__name__).lower()
-    name = vars(found).get('name') or snake     # an inherited one would be another controller's
+    # an inherited name would be another controller's
+    name = vars(found).get('name') or snake_case(found.__name__)
     if not re.fullmatch(r'[a-z][a-z0-9_]*', name) or name in (*SHIPPED, *RESERVED):
         raise ParameterError(f"controller '{spec or name}': '{name}' is no usable name; expected "
                              "small letters, digits and _ (the class's attribute 'name'), and "

@@ -26,13 +26,14 @@ from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim.fault_lists import load_faults
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.stack.loop import FlightLoop
+from beetle_omni_ros.stack.plugin import made
 
 
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,
         conditions: str = 'nominal', seed: int = 0,
         options: Mapping[str, ControllerOptions] = MappingProxyType({}),
         built: Controller | None = None, bag: Path | None = None, meta: dict | None = None,
-        faults: Sequence[Fault] = (), actuators: str = 'direct',
+        faults: Sequence[Fault] = (), actuators: str = 'direct', components: Sequence[str] = (),
         progress: Callable[..., None] | None = None) -> FlightLog:
     """
     Fly one task with one controller, a name or a reference to a class; ``built`` is that one.
@@ -63,7 +64,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
             from beetle_omni_ros.stack.real_time import EmulatedLoop  # has serial ports
             kind = EmulatedLoop
         flight = kind(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
-                      faults=faults, epoch=int(time()))
+                      faults=faults, epoch=int(time()), others=made(components, robot))
         stack.callback(flight.close)
         flight.fly(task, progress)
     return memory.log()
@@ -74,7 +75,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
                  bag: Path | None = None, json_path: Path | None = None,
                  options: Mapping[str, ControllerOptions] = MappingProxyType({}),
                  faults: Path | None = None, actuators: str = 'direct',
-                 console: Console | None = None) -> dict:
+                 components: Sequence[str] = (), console: Console | None = None) -> dict:
     """
     Fly a task with each controller and report; arguments as of `beetle_omni evaluate`.
 
@@ -122,7 +123,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             log = fly(entry.reference, task, robot=believed, plant=true, conditions=conditions,
                       seed=seed, options=options, built=controller,
                       bag=bag / name if bag and len(built) > 1 else bag, meta=meta,
-                      faults=injected, actuators=actuators,
+                      faults=injected, actuators=actuators, components=components,
                       progress=lambda completed, bar=bar: bars.update(
                           bar, completed=completed) or interrupts)
             results[name] = metrics(log, task)

@@ -7,7 +7,7 @@ A new topic is one entry. Names are relative; a robot may have a namespace.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -165,6 +165,16 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in TABLE if topic.in_fli
 # Not of a robot alone: /NAME/command may be of a controller, and other programs have the others.
 TELLING = TOPICS.keys() - {'command', 'diagnostics', 'odom'}
 """Topics that determine the namespace of a robot in a bag."""
+
+
+def register(topic: Topic) -> None:
+    """Add a topic of a component of others to the table, in this process."""
+    ALL[topic.name] = topic
+
+
+def topic_like(known: str, name: str, meaning: str) -> Topic:
+    """Return a topic with the type and values of a known one."""
+    return replace(topic_of(known), name=name, meaning=meaning, required=False, in_flight=False)
 
 
 def topics_with(controllers: Iterable[str]) -> dict[str, Topic]:

@@ -1,6 +1,6 @@
 """`beetle_omni fly`: fly the ROS graph, record a bag, and print the results from the bag."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager, ExitStack
 from pathlib import Path
 import subprocess
@@ -53,7 +53,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             robot: Path | None = None, plant: Path | None = None, nmpc: Path | None = None,
             policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
-            domain_id: int | None = None, view: bool = False,
+            components: Sequence[str] = (), domain_id: int | None = None, view: bool = False,
             console: Console | None = None) -> int:
     """
     Fly a task through the ROS graph and print the results of the bag.
@@ -84,7 +84,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             plant_file=_absolute(plant and find_robot(plant)),
             conditions=conditions, seed=int(seed),
             task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-            ports=str(folder), clock=clock, actuators=_checked(injected, actuators))
+            ports=str(folder), clock=clock, actuators=_checked(injected, actuators),
+            components=components)
         nodes['sim_node']['task_faults'] = '; '.join(map(str, injected))
         if clock == 'simulated':    # it begins when all nodes are there
             nodes['sim_node']['pause_at'] = 0.0

@@ -5,7 +5,7 @@ Discovery is limited to this computer by default: a second robot or simulation i
 would publish on the same topics.
 """
 
-from collections.abc import MutableMapping
+from collections.abc import MutableMapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from itertools import count
@@ -24,6 +24,7 @@ import beetle_omni_ros
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
+from beetle_omni_ros.stack.plugin import component_class, node_name
 
 BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
 READY = 'ready'         # begin of a bridge's state
@@ -111,14 +112,16 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
          policy: str = '', allow_other_robot: bool = False, simulated: bool = True,
          actuators: str | None = None, ports: str = '', robot_file: str = '', plant_file: str = '',
          conditions: str = 'nominal', seed: int = 0, task: str = '', bag: str = '',
-         viewer: bool = False, clock: str = 'system') -> tuple[Parameters, dict[str, str]]:
+         viewer: bool = False, clock: str = 'system',
+         components: Sequence[str] = ()) -> tuple[Parameters, dict[str, str]]:
     """
     List the nodes of a graph; a file '' is the shipped one.
 
     The arguments are options of `beetle_omni fly` and arguments of the launch file. Without
     ``simulated`` sensors and actuators are nodes started elsewhere; on the robot deploy/install.sh
     starts the bridges. ``actuators`` are 'emulated' devices behind the bridges, with ports in the
-    folder ``ports``, or 'direct': from the topic to the simulator.
+    folder ``ports``, or 'direct': from the topic to the simulator. ``components`` are references
+    to further components, 'FILE.py:Class'.
 
     Returns:
         Node name -> parameters; omitted standby controller -> reason.
@@ -148,6 +151,8 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
         *((name, True, values) for name, values in controllers.items()),
         ('supervisor_node', True, {**robot, 'controller': active, **others}),
         ('reference_node', task, {'task': task, 'seed': seed}),
+        *((node_name(component_class(reference)), True, {'component': reference, **robot})
+          for reference in components),
         ('viewer_node', viewer, {}),
         # After the controllers, whose start would keep its emulated devices from answering.
         ('sim_node', simulated, {**plant, 'conditions': conditions, 'seed': seed,
@@ -242,8 +247,9 @@ def commands(nodes: Parameters, folder: Path, groups: dict[str, list[str]] | Non
     file.write_text(yaml.safe_dump({f'/**/{node}': {'ros__parameters': values}
                                     for node, values in nodes.items()}))
     return {process: [sys.executable, '-m', 'beetle_omni_ros.start', COMPOSED,
-                      # A controller without an executable is named by its reference.
-                      *(name if name in NODES else nodes[name]['controller'] for name in names),
+                      # What has no executable is named by its reference.
+                      *(name if name in NODES else nodes[name].get('controller')
+                        or nodes[name]['component'] for name in names),
                       '--ros-args', '--params-file', str(file)]
             for process, names in groups.items() if names}
 

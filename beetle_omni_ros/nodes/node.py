@@ -15,7 +15,9 @@ from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.graph import claim
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import parameter
 from beetle_omni_ros.stack.component import Component, DIAGNOSTICS_PERIOD
+from beetle_omni_ros.stack.plugin import node_name
 
 
 class FlightNode(Node):
@@ -139,6 +141,15 @@ class FlightNode(Node):
         self.close()
         super().destroy_node()
         self._claim.close()
+
+
+class ComponentNode(FlightNode):
+    """Node of a component of others; ``reference`` is that of its class."""
+
+    def __init__(self, kind: type[Component], reference: str):
+        super().__init__(node_name(kind), robot_file=parameters.file_parameter(),
+                         component=parameter(reference, doc='component that this node runs'))
+        self.run(kind(self.robot))      # type: ignore[arg-type]
 
 
 def _answer(service, _, response):

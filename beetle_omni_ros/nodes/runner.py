@@ -21,7 +21,9 @@ from rclpy.utilities import remove_ros_args
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.nodes.graph import COMPOSED, confine, CONTROLLER, NODES
+from beetle_omni_ros.nodes.node import ComponentNode
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError, RunError
+from beetle_omni_ros.stack.component import Component
 
 OK, FAILED, UNUSABLE = 0, 1, 2
 # s; without a timeout, the events executor of Jazzy dispatches no callbacks.
@@ -35,6 +37,9 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 
 def maker(name: str) -> Callable:
     """Import what makes the node of an executable, or of a controller by name or reference."""
+    if ':' in name and isinstance(kind := registry.loaded(name), type) \
+            and issubclass(kind, Component):
+        return partial(ComponentNode, kind, name)
     place = NODES.get(name, CONTROLLER)
     module, _, kind = place.partition(':')
     made = getattr(import_module(f'{__package__}.{module}'), kind)

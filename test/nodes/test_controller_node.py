@@ -16,7 +16,9 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.stack import component as base
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
-OWN = f"{Path(__file__).resolve().parents[2] / 'examples' / 'own_controller.py'}:PoseController"
+EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
+OWN, OBSERVER = (f'{EXAMPLES}/own_controller.py:PoseController',
+                 f'{EXAMPLES}/own_component.py:WrenchObserver')
 FAILING = """from beetle_omni_ros.control.hover import HoverController
 
 
@@ -76,3 +78,11 @@ def test_the_plan_of_a_graph_with_another_controller(tmp_path):
     assert OWN in command and 'ekf_node' in command
     alone, _ = graph.plan(OWN, actuators='direct', standby=False)
     assert list(alone) == ['ekf_node', 'pose_controller_node', 'supervisor_node', 'sim_node']
+
+
+def test_a_component_of_others_is_a_node_with_its_topics(make):
+    node = make(maker(OBSERVER))
+    assert '/observer/force' in {one.topic_name for one in node.publishers}
+    assert {'/command', '/odom', '/imu/data_raw'} <= {
+        one.topic_name for one in node.subscriptions}
+    assert node.get_name() == node.component.name == 'wrench_observer_node'
