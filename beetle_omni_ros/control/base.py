@@ -14,10 +14,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, NO_ZEROS, ROTORS
+from beetle_omni_ros.robot.mode import FLYING, Mode
 
 AT_REST = np.zeros(3)           # velocity of a pose
 AT_REST.flags.writeable = False
-MOTORS_OFF = ('disarmed', 'emergency_stop')     # states of the supervisor
 # Folders of the package, of installed packages and of Python itself.
 LIBRARIES = (str(Path(__file__).resolve().parents[1]),
              *(sysconfig.get_path(name) for name in ('purelib', 'platlib', 'stdlib')), '<frozen')
@@ -254,7 +254,7 @@ class ControllerHost:
     Attributes:
         target: target of the operator or the task, or None.
         override: target of the supervisor, which replaces it, or None.
-        mode: state of the supervisor, 'flying:NAME' while the controller NAME is active.
+        mode: state of the supervisor.
         errors: number of exceptions; ``error`` is the last one in one line.
 
     """
@@ -270,19 +270,19 @@ class ControllerHost:
         self._hold: Target | None = None
         self._position: np.ndarray | None = None
         self._health = ALL_HEALTHY
-        self.mode, self._own_mode = '', f'flying:{name}'
+        self.mode = Mode()
 
     @property
     def active(self) -> bool:
         """Whether the controller flies."""
-        return self.mode == self._own_mode
+        return self.mode.controller == self._name
 
     @property
     def target_in_force(self) -> Target | None:
         """Target of the next step; None before the first estimate."""
         return self.override or self.target or self._hold
 
-    def on_mode(self, mode: str, now: float) -> str:
+    def on_mode(self, mode: Mode, now: float) -> str:
         """
         Follow the supervisor; motors that stop reset the controller and its targets.
 
@@ -290,9 +290,8 @@ class ControllerHost:
             why the target is dropped at the takeover from another controller, or ''.
 
         """
-        state, before = mode.partition(':')[0], self.mode
-        self.mode = mode
-        if state in MOTORS_OFF and before.partition(':')[0] != state:
+        before, self.mode = self.mode, mode
+        if mode.motors_off and before.state != mode.state:
             self.call('reset')
             self._hold = self.override = None
         if not self.active or mode == before or self.target is None:
@@ -310,7 +309,7 @@ class ControllerHost:
     def on_estimate(self, estimate: Any) -> None:
         """Take position (3,), quaternion (4,) and stamp of each estimate."""
         self._position = estimate.position
-        if self.target is None and (self._hold is None or not self.mode.startswith('flying')):
+        if self.target is None and (self._hold is None or self.mode.state != FLYING):
             self._hold = PoseTarget(estimate.position, estimate.quaternion, estimate.stamp)
 
     def too_far(self, target: Target, now: float) -> str:

@@ -15,6 +15,7 @@ from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.mavlink import BOARD, common, HOST, MavlinkReceiver, restarted
 from beetle_omni_ros.drivers.motor_board_state import BoardState, RotorStates
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
+from beetle_omni_ros.robot.mode import DISARMED, Mode, MOTORS_OFF
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading
 from beetle_omni_ros.robot.thrust_map import ThrustMap
@@ -29,8 +30,6 @@ ATTEMPTS = 5            # of a command
 RECONNECT = 0.05        # [s] between attempts to open a lost port
 RESULTS = {1: 'refused', 2: 'denied', 3: 'unsupported', 4: 'failed'}
 
-DISARMED = 'disarmed'
-RESTING = (DISARMED, 'emergency_stop')      # states of the supervisor without thrust
 RESTS, ARMS, FLIES, LOST = 'rests', 'arms', 'flies', 'lost'
 # A board that is not ready is tolerated for this long [s], counted in steps of at most STEP [s]:
 # after a pause of this process the waiting messages of the board are read first.
@@ -326,11 +325,11 @@ class Arming:
         if reason and self.phase in (ARMS, FLIES):
             self._set_lost(reason)
 
-    def follow(self, state: str) -> None:
-        """Act on the state of the supervisor, 'STATE' or 'STATE: FAULT'."""
-        state = state.partition(':')[0]
+    def follow(self, mode: Mode) -> None:
+        """Act on the state of the supervisor."""
+        state = mode.state
         before, self._supervisor = self._supervisor, state
-        if state in RESTING:
+        if mode.motors_off:
             if self.phase != LOST or state == DISARMED:
                 self.phase = RESTS
             if before != state:
@@ -339,7 +338,7 @@ class Arming:
             self.phase, self._disarm = ARMS, False
             self._command = self._board.start(True)
             self._check_answer()
-        elif before in RESTING or not before:
+        elif before in MOTORS_OFF or not before:
             self._set_lost(self._inhibited or 'the supervisor was not disarmed before')
 
     def update(self, elapsed: float) -> None:

@@ -19,6 +19,7 @@ from beetle_omni_ros.messages.bag_types import new
 from beetle_omni_ros.messages.values import Diagnostic, MessageError, Odom, Wrench
 from beetle_omni_ros.robot import readings, rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.mode import Mode
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 
 WORLD, BODY = 'world', 'base_link'
@@ -331,6 +332,10 @@ def write_override(target: TrajectoryTarget | None) -> Any:
 # --- text ---------------------------------------------------------------------------------------
 
 read_text: Callable[[Any], str] = attrgetter('data')
+
+
+def read_mode(message: Any) -> Mode:
+    return Mode(message.data)
 
 
 def write_text(value: str) -> Any:

@@ -16,6 +16,7 @@ from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages import conversions as c
 from beetle_omni_ros.messages.values import Diagnostic, Odom, Wrench
 from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.mode import Mode
 from beetle_omni_ros.robot.readings import (
     BatteryReading,
     ImuReading,
@@ -152,8 +153,8 @@ TABLE = (
           c.write_wrench,
           'external wrench on the simulated robot until the next message: force in world, torque '
           'in base_link; a user or an experiment publishes it', ('force', 'torque')),
-    _text('supervisor/state', 'state, a colon, and the active controller or the last fault',
-          in_flight=True),
+    Topic('supervisor/state', 'std_msgs/msg/String', LATCHED, Mode, c.read_mode, c.write_text,
+          'state, a colon, and the active controller or the last fault'),
     Topic('diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', EVENT, Diagnostic,
           c.read_diagnostics, c.write_diagnostics,
           'health, rates, ages, timing and faults of each node'),

@@ -14,7 +14,7 @@ from sensor_msgs.msg import Joy
 
 from beetle_omni_ros import drive
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import MOTORS_OFF, PoseTarget
+from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.drive import Action, DriveParameters, Steering
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
@@ -60,13 +60,13 @@ class Driver(Operator):
     @property
     def flies(self) -> bool:
         """Whether a controller flies, and so follows targets."""
-        return self.state.startswith('flying')
+        return bool(self.state.controller)
 
     @property
     def at_goal(self) -> bool:
         """Whether the robot is at its goal; if no controller flies, whether it is at rest."""
         if not self.flies:
-            return self.state in MOTORS_OFF
+            return self.state.motors_off
         steering = self.steering
         return steering is not None and steering.arrived and self.odom is not None and bool(
             np.linalg.norm(self.odom.position - steering.position) < NEAR) and \
@@ -101,7 +101,7 @@ class Driver(Operator):
             accepted, answer = self.call(name)
             return f"{name}: {answer or ('done' if accepted else 'refused')}"
         if name == 'controller':
-            names, now = list(registry.STANDING_BY), self.state.partition(':')[2]
+            names, now = list(registry.STANDING_BY), self.state.controller
             other = names[(names.index(now) + 1) % len(names)] if now in names else names[0]
             wanted = values[0] if values else other
             accepted, answer = self.set('supervisor_node', 'controller', wanted)

@@ -11,7 +11,6 @@ from rich.console import Console
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import MOTORS_OFF
 from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.graph import (
     BRIDGES,
@@ -178,7 +177,7 @@ def _fly(graph: Graph, controller: str, task: Task, console: Console,
                 except RunError as error:
                     failure = failure or str(error)
     finally:
-        stubborn = graph.stop(in_flight=bool(flight and flight.state not in ('', *MOTORS_OFF)))
+        stubborn = graph.stop(in_flight=bool(flight and flight.state.in_flight))
         if flight:
             flight.close()
     for name in stubborn:
@@ -243,8 +242,8 @@ class Flight(Operator):
         def is_done():
             self.show(f'{name}: {self.progress}, {self.time() - start:.0f} of '
                        f'{self._task.duration:.0f} s ({self.state})')
-            if self.state in MOTORS_OFF:
-                raise RunError(f"the flight ended early, supervisor in '{self.state}'")
+            if self.state.motors_off:
+                raise RunError(f"the flight ended early, supervisor in '{self.state.state}'")
             return self.progress.startswith('done')
 
         self.expect(name, is_done, self._task.duration + SPARE_TIME,
@@ -253,12 +252,12 @@ class Flight(Operator):
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop; RunError: no landing."""
         self._lands = True
-        if self.state in ('', *MOTORS_OFF) or COMPOSED in self._graph.dead():
+        if not self.state.in_flight or COMPOSED in self._graph.dead():
             return      # a dead supervisor does not answer, and its clock stands still
         accepted, answer = self.call('land')
         if not accepted:
             raise RunError(f'no landing: {answer}')
-        self.expect('landing', lambda: self.state in MOTORS_OFF, LANDING_TIMEOUT)
+        self.expect('landing', lambda: self.state.motors_off, LANDING_TIMEOUT)
         self.spin(1.1)      # the last diagnostics
 
     def spin(self, seconds: float) -> None:
@@ -269,7 +268,7 @@ class Flight(Operator):
         if dead := self._graph.dead():
             raise RunError('; '.join(f'{name} died ({how})' for name, how in dead.items()))
         status = self.diagnostics.get(f'{self.controller}_node: controller')
-        if status is not None and status.level >= ERROR and not self.state.startswith('flying'):
+        if status is not None and status.level >= ERROR and not self.state.controller:
             raise RunError(status.message)
         status = self.diagnostics.get('recorder_node: bag')
         if status is not None and status.level >= ERROR:

@@ -24,6 +24,7 @@ from beetle_omni_ros.messages.topics import LOG, Qos, SENSOR, TARGETS, TOPICS
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.graph import BRIDGES, confine, domains_in_use, READY
+from beetle_omni_ros.robot.mode import DISARMED, Mode
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 
 # Simulated time may be slow, or stop if the simulator dies: waiting ends after this much steady
@@ -106,8 +107,8 @@ class Operator(Client):
     def __init__(self, domain: int | None, controller: str = registry.DEFAULT):
         super().__init__('operator', domain)
         self.controller = controller
-        self.state = self.progress = ''
-        self.states: list[str] = []
+        self.state, self.progress = Mode(), ''
+        self.states: list[Mode] = []
         self.bridges: dict[str, str] = {}
         self.diagnostics: dict[str, Diagnostic] = {}
         self._offset: float | None = None   # s from /clock to time(), which goes on steadily
@@ -130,10 +131,9 @@ class Operator(Client):
             self._offset = time.monotonic() - self._clock
             self._epoch = math.floor(self._clock)
 
-    def _on_state(self, text):
-        state = text.partition(':')[0]
-        self.state = text if state == 'flying' else state
-        self.states.append(text)
+    def _on_state(self, mode):
+        self.state = Mode(mode if mode.controller else mode.state)
+        self.states.append(mode)
 
     def time(self) -> float:
         """Return a time that passes like that of the flight, simulated or steady [s]."""
@@ -191,9 +191,9 @@ class Operator(Client):
                         ARM_TIMEOUT, lambda: f'; supervisor_node: {answers[-1][1]}')
             self.states.clear()
             # The state may name a fault: disarmed:joint1_astray.
-            self.expect('taking off', lambda: self.state.startswith('flying') or any(
-                state.startswith('disarmed') for state in self.states), TAKEOFF_TIMEOUT)
-            if self.state.startswith('flying'):
+            self.expect('taking off', lambda: self.state.controller or any(
+                mode.state == DISARMED for mode in self.states), TAKEOFF_TIMEOUT)
+            if self.state.controller:
                 return
         raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
 

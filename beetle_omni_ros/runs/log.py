@@ -19,6 +19,7 @@ import numpy as np
 from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.messages.values import Diagnostic
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.mode import FALLBACK, Mode
 
 SERIES = {
     'truth': {'position': 3, 'quaternion': 4, 'velocity': 3, 'angular_velocity': 3},
@@ -81,7 +82,7 @@ class FlightLog:
             base_link [N m], each valid until the next.
         requests: controller -> its commands, before the supervisor.
         targets: pose and trajectory targets in the order of their stamps.
-        state_t, states: (S,) times and names of the supervisor's states.
+        state_t, states: (S,) times and the supervisor's states.
         compute: controller, or another node's name without '_node' -> median, p99, max [ms],
             deadline_misses, count (cumulative).
         compute_history: the same names -> list of (t, such a dict), one for each report.
@@ -95,7 +96,7 @@ class FlightLog:
     requests: dict[str, Commands] = field(default_factory=dict)
     targets: list[Target] = field(default_factory=list)
     state_t: np.ndarray = field(init=False)
-    states: list[str] = field(default_factory=list)
+    states: list[Mode] = field(default_factory=list)
     compute: dict[str, dict] = field(default_factory=dict)
     compute_history: dict[str, list] = field(default_factory=dict)
     diagnostics: list[Diagnostic] = field(default_factory=list)
@@ -135,9 +136,8 @@ class FlightLog:
         """Return the supervisor's fault names -> time of the first report [s], by time."""
         found: dict[str, float] = {}
         for t, state in zip(self.state_t, self.states, strict=True):
-            kind, _, fault = state.partition(':')
-            if fault and kind != 'flying':
-                found.setdefault(fault, float(t))
+            if state.fault:
+                found.setdefault(state.fault, float(t))
         for entry in self.diagnostics:
             if entry.name.endswith(SUPERVISOR_STATUS):
                 for key in entry.values:
@@ -160,9 +160,8 @@ class FlightLog:
             return [(self.start, self.meta.get('controller', only))]
         changes: list[tuple[float, str | None]] = []
         for t, state in zip(self.state_t, self.states, strict=True):
-            kind, _, name = state.partition(':')
-            active = name if kind == 'flying' else None
-            if kind == 'fallback' and changes:
+            active = state.controller or None
+            if state.state == FALLBACK and changes:
                 active = changes[-1][1]
             if not changes or changes[-1][1] != active:
                 changes.append((float(t), active))
@@ -202,7 +201,7 @@ class LogRecorder(Recorder):
         # topic -> flat rows: hours of flight fit
         self._rows: dict[str, array] = defaultdict(partial(array, 'd'))
         self._log = FlightLog(meta=dict(meta or {}))
-        self._states: list[tuple[float, str]] = []
+        self._states: list[tuple[float, Mode]] = []
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
         """Record one value; other topics than those of a log are ignored."""
@@ -233,7 +232,7 @@ class LogRecorder(Recorder):
         if topic in ('target_pose', 'target_trajectory'):
             self._log.targets.append(value)
         elif topic == 'supervisor/state':
-            self._states.append((received, value))
+            self._states.append((received, Mode(value)))
         elif topic == 'diagnostics':
             for entry in value:
                 node, _, kind = entry.name.rpartition(': ')

@@ -10,9 +10,10 @@ from itertools import groupby
 
 import numpy as np
 
-from beetle_omni_ros.control.base import MOTORS_OFF, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.pages.page import at
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.mode import DISARMED, FALLBACK, LANDING, MOTORS_OFF, STOPPED
 from beetle_omni_ros.robot.schema import shortened
 from beetle_omni_ros.runs.log import (
     errors,
@@ -122,7 +123,7 @@ def _split(log, task):
         if flew:
             landed = next((float(t) for t, state in zip(log.state_t, log.states, strict=True)
                            if t > target.stamp
-                           and state.partition(':')[0] in ('landing', 'disarmed')), np.inf)
+                           and state.state in (LANDING, DISARMED)), np.inf)
             intervals.append((target.stamp, min(end, landed)))
     return {name: part for name, part in parts.items() if any(part)}
 
@@ -130,9 +131,9 @@ def _split(log, task):
 def _controller_metrics(log, task, name, poses, intervals, *, is_alone):
     body = motion(log)
     ended_at, ending = _early_end(log, task)
-    states = [state.partition(':')[0] for state in log.states]
+    states = [state.state for state in log.states]
     hovered = [(t, until) for t, until, state in zip(
-        log.state_t, [*log.state_t[1:], np.inf], states, strict=False) if state == 'fallback']
+        log.state_t, [*log.state_t[1:], np.inf], states, strict=False) if state == FALLBACK]
     flown = [_pose(body, log.targets[k], task, ended_at, hovered) for k in poses]
     # If one controller flew the whole task, poses after an early end count as missed.
     whole = task and is_alone and not log.meta.get('interrupted')
@@ -182,8 +183,8 @@ def _early_end(log, task):
     start = log.targets[0].stamp if log.targets else np.inf
     due = start + task.duration - END_MARGIN if task else np.inf
     for t, state in zip(log.state_t, log.states, strict=True):
-        kind, _, reason = shortened(state).partition(':')
-        if t <= start or kind not in ('landing', 'emergency_stop', 'disarmed'):
+        kind, reason = state.state, shortened(state.fault)
+        if t <= start or not (kind == LANDING or state.motors_off):
             continue
         if t < due and (reason or (task and task.kind not in ('force', 'torque'))):
             return float(t), f"{kind}{': ' if reason else ''}{reason} at {t - start:.1f} s"
@@ -195,14 +196,14 @@ def _early_end(log, task):
 def _landing(log, body, states):
     """Speed at the touchdown of the last landing, and whether it was a fall; None without one."""
     k = 1 + max((k for k, state in enumerate(states)
-                 if state not in ('landing', *MOTORS_OFF)), default=-1)
-    if not len(body.t) or 'landing' not in states[k:k + 1] or states[-1] == 'landing':
+                 if state not in (LANDING, *MOTORS_OFF)), default=-1)
+    if not len(body.t) or LANDING not in states[k:k + 1] or states[-1] == LANDING:
         return None
     near = (body.t >= log.state_t[k]) & (body.position[:, 2] < body.position[-1, 2] + TOUCHDOWN)
     speed = _reduced(np.max, np.linalg.norm(body.velocity[near], axis=1))
     upright = rotations.matrix(body.quaternion[-1])[2, 2] > np.cos(np.radians(FALL_INCLINATION))
     return {'speed_m_s': speed, 'fell': bool(
-        states[-1] == 'emergency_stop' or not upright or (speed or 0.0) > FALL_SPEED)}
+        states[-1] == STOPPED or not upright or (speed or 0.0) > FALL_SPEED)}
 
 
 def _pose(body, target, task, ended_at, hovered):
@@ -254,7 +255,7 @@ def failed(result: dict) -> str:
 def _crashed(log, body, intervals):
     """Whether the robot hit the ground, had an emergency stop, or has a non-finite position."""
     position = body.position[inside(body.t, intervals)]
-    stopped = any(state.startswith('emergency_stop') for state, is_flown in zip(
+    stopped = any(state.state == STOPPED for state, is_flown in zip(
         log.states, inside(log.state_t, intervals), strict=True) if is_flown)
     return bool(CRASH in log.states or stopped or not np.all(np.isfinite(position))
                 or np.any(position[:, 2] < GROUND_HEIGHT))

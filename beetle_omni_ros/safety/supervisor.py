@@ -14,6 +14,17 @@ import numpy as np
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, Fallback, PoseTarget, Target
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY, clipped, NO_ZEROS, ROTORS
+from beetle_omni_ros.robot.mode import (
+    DISARMED,
+    FALLBACK,
+    FLYING,
+    IN_FLIGHT,
+    LANDING,
+    Mode,
+    MOTORS_OFF,
+    STOPPED,
+    TAKEOFF,
+)
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.commands import within_limits
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
@@ -23,9 +34,6 @@ from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.way import coasted, halting, inclination
 from beetle_omni_ros.safety.wrench import NEAR_GROUND
 
-DISARMED, TAKEOFF, FLYING = 'disarmed', 'takeoff', 'flying'
-FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
-IN_FLIGHT = (TAKEOFF, FLYING, FALLBACK, LANDING)
 AGE_LIMIT = 0.1         # [s] no older command is sent; the actuators have the same limit
 STOP_TIME = 0.3         # [s] zero thrust is sent for this time, then nothing
 HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
@@ -398,7 +406,7 @@ class Supervisor(Inputs):
 
     def _enter(self, state, severity, text):
         self.state, self._in_state, self.target_override = state, 0.0, None
-        if state in (DISARMED, STOPPED):
+        if state in MOTORS_OFF:
             self.backup.running = self.airborne = False
         if state == FLYING:
             self._handover_left = HANDOVER_TIME
@@ -420,12 +428,12 @@ class Supervisor(Inputs):
     # Reports ----------------------------------------------------------------------------------
 
     @property
-    def reported_state(self) -> str:
-        """The state with its controller ('flying:nmpc') or its last fault ('landing:crash')."""
+    def mode(self) -> Mode:
+        """The state with its controller or its last fault."""
         if self.state == FLYING:
-            return f'{FLYING}:{self.active}'
-        fault = next(reversed(self.faults), '') if self.state != TAKEOFF else ''
-        return f'{self.state}:{fault}' if fault else self.state
+            return Mode.of(FLYING, self.active)
+        return Mode.of(self.state, next(reversed(self.faults), '')
+                       if self.state != TAKEOFF else '')
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """State, sources and refusals, flat, for operators and logs."""

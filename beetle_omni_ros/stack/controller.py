@@ -10,7 +10,6 @@ from beetle_omni_ros.control.base import (
     Controller,
     ControllerHost,
     guidance_of,
-    MOTORS_OFF,
     PoseTarget,
     State,
 )
@@ -84,7 +83,7 @@ class ControllerComponent(Component):
             self.stepper.target = target
 
     def _on_mode(self, mode):
-        if mode.partition(':')[0] in MOTORS_OFF:
+        if mode.motors_off:
             self._command = None
         if reason := self.stepper.on_mode(mode, self.host.now()):
             self.reject('target_pose', f'{reason}; the present pose is held', CANNOT_BE_FLOWN)

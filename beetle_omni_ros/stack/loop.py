@@ -16,16 +16,16 @@ import gc
 import math
 from typing import Any
 
-from beetle_omni_ros.control.base import Controller, MOTORS_OFF, PoseTarget, Target
+from beetle_omni_ros.control.base import Controller, PoseTarget, Target
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.messages.topics import ALL, TARGETS
+from beetle_omni_ros.robot.mode import FLYING, IN_FLIGHT, MOTORS_OFF, TAKEOFF
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs.log import Recorder
 from beetle_omni_ros.runs.tasks import Task
 from beetle_omni_ros.safety.events import Event
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.supervisor import IN_FLIGHT, TAKEOFF
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
@@ -295,7 +295,7 @@ class FlightLoop(Loop):
 
         """
         asked, supervisor = False, self.supervisor
-        while supervisor.state != 'flying':
+        while supervisor.state != FLYING:
             self.step()
             if error := self._controllers[supervisor.active].stepper.error:
                 raise ParameterError(error)

@@ -4,9 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from beetle_omni_ros.control.base import MOTORS_OFF, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Wrench
+from beetle_omni_ros.robot.mode import FLYING, LANDING
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer, WITH_WRENCHES
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.stack.component import Component, OK
@@ -54,11 +55,11 @@ class Reference(Component):
     def _on_odom(self, odom):
         self._odom = odom
 
-    def _on_supervisor(self, state):
-        if self.state == WAITING and state.startswith('flying'):
+    def _on_supervisor(self, mode):
+        if self.state == WAITING and mode.state == FLYING:
             self._player = TaskPlayer(self._task, self.host.now())
             self.host.log(INFO, f"task '{self._task.name}', {self._task.ends[-1]:g} s")
-        elif self._player and state.partition(':')[0] in ('landing', *MOTORS_OFF):
+        elif self._player and (mode.motors_off or mode.state == LANDING):
             self._player = None
             self.update(STATE, ABORTED)
 

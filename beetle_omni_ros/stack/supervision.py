@@ -9,10 +9,11 @@ import numpy as np
 
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.control.hover import HoverController
+from beetle_omni_ros.robot.mode import FALLBACK, FLYING, STOPPED
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Answer, Event
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.supervisor import FALLBACK, FLYING, STOPPED, Supervisor
+from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.stack.component import Component, ERROR, IDENTITY, OK, WARN
 from beetle_omni_ros.stack.estimator import SENSOR_AGE
 
@@ -120,7 +121,7 @@ class SupervisorComponent(Component):
 
     def _publish_states(self):
         supervisor = self.supervisor
-        self.update('supervisor/state', supervisor.reported_state)
+        self.update('supervisor/state', supervisor.mode)
         self.update('supervisor/target', supervisor.target_override)
         self.update('supervisor/actuators', supervisor.health)
         for event in supervisor.events:

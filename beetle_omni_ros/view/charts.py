@@ -203,10 +203,11 @@ def _states(run):
     changes = [k for k, state in enumerate(run.log.states)
                if k == 0 or run.log.states[k - 1] != state][:MOST_MARKS]
     begins = run.log.state_t[changes]
-    names = [shortened(run.log.states[k]) for k in changes]
+    modes = [run.log.states[k] for k in changes]
+    names = [shortened(mode) for mode in modes]
     return go.Bar(
         base=begins - run.log.begin, x=np.diff(begins, append=run.log.end),
         y=[run.label] * len(names), orientation='h', text=names, hovertext=names,
         textposition='inside', insidetextanchor='start', legendgroup=run.label, name=run.label,
-        marker={'color': [STATE_COLOURS.get(name.partition(':')[0], '#dfe3e8')
-                          for name in names]})
+        marker={'color': [STATE_COLOURS.get(mode.state, '#dfe3e8')
+                          for mode in modes]})

@@ -14,6 +14,7 @@ from beetle_omni_ros.control.base import (
     TrajectoryTarget,
 )
 from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.mode import Mode
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -53,9 +54,9 @@ def flown(host, x):
 
 def test_without_a_target_the_pose_of_the_takeover_is_held():
     host = ControllerHost('own', Own())
-    host.on_mode('takeoff', 0.0)
+    host.on_mode(Mode('takeoff'), 0.0)
     assert [flown(host, x) for x in (1.0, 2.0)] == [1.0, 2.0]
-    host.on_mode('flying:own', 0.0)
+    host.on_mode(Mode('flying:own'), 0.0)
     assert [flown(host, x) for x in (3.0, 4.0)] == [2.0, 2.0]
     host.target = at(5.0)
     assert flown(host, 4.0) == 5.0
@@ -66,15 +67,15 @@ def test_without_a_target_the_pose_of_the_takeover_is_held():
 @pytest.mark.parametrize('stopped', ['disarmed', 'emergency_stop:crash'])
 def test_motors_that_stop_clear_hold_and_override_once_and_keep_the_target(stopped):
     host = ControllerHost('own', Own())
-    host.on_mode('flying:own', 0.0)
+    host.on_mode(Mode('flying:own'), 0.0)
     assert flown(host, 1.0) == flown(host, 2.0) == 1.0
     host.override = at(6.0)
-    host.on_mode(stopped, 0.0)
-    host.on_mode(f'{stopped}:again', 0.0)
+    host.on_mode(Mode(stopped), 0.0)
+    host.on_mode(Mode(f'{stopped}:again'), 0.0)
     assert host.override is None and host.controller.resets == 1
     assert flown(host, 3.0) == 3.0
     host.target = at(5.0)
-    host.on_mode('emergency_stop' if stopped == 'disarmed' else 'disarmed', 0.0)
+    host.on_mode(Mode('emergency_stop' if stopped == 'disarmed' else 'disarmed'), 0.0)
     assert flown(host, 3.0) == 5.0 and host.controller.resets == 2
 
 
@@ -88,11 +89,11 @@ def test_a_target_beyond_the_reach_is_dropped_at_the_takeover_only():
                              np.array([LEVEL, LEVEL]), np.zeros((2, 3)), np.zeros((2, 3)))
     assert host.too_far(track, 0.0) and not host.too_far(track, 5.0)
     host.target = at(17.0)
-    assert host.on_mode('flying:other', 0.0) == '' and flown(host, 10.0) == 17.0
-    assert '7 m from the robot' in host.on_mode('flying:own', 0.0)
+    assert host.on_mode(Mode('flying:other'), 0.0) == '' and flown(host, 10.0) == 17.0
+    assert '7 m from the robot' in host.on_mode(Mode('flying:own'), 0.0)
     assert flown(host, 10.0) == 10.0
     host.target = at(17.0)
-    assert host.on_mode('flying:own', 0.0) == '' and flown(host, 10.0) == 17.0
+    assert host.on_mode(Mode('flying:own'), 0.0) == '' and flown(host, 10.0) == 17.0
 
 
 @pytest.mark.parametrize('part', ['velocity', 'tilt'])
@@ -115,8 +116,8 @@ def test_an_exception_of_any_method_is_counted_and_reported(method):
     host = ControllerHost('own', Own(), report=reported.append)
     setattr(host.controller, method, fail)
     for _ in range(2):
-        host.on_mode('flying:own', 0.0)
-        host.on_mode('disarmed', 0.0)
+        host.on_mode(Mode('flying:own'), 0.0)
+        host.on_mode(Mode('disarmed'), 0.0)
         host.on_health(SimpleNamespace(zeros=ActuatorHealth().zeros))
         host.on_estimate(state())
         assert (host.step(state()) is None) == (method == 'step')

@@ -9,6 +9,7 @@ pytest.importorskip('serial')
 
 from beetle_omni_ros.drivers.motor_board import Arming, PATIENCE, STEP
 from beetle_omni_ros.drivers.motor_board_state import BoardStatus
+from beetle_omni_ros.robot.mode import Mode
 
 CYCLE = 0.005
 DISARMED = BoardStatus('disarmed', 'none', (), 1)
@@ -45,7 +46,7 @@ def bench():
 
 
 def disarmed(board, arming):
-    arming.follow('disarmed')
+    arming.follow(Mode('disarmed'))
     board.answer()
     arming.update(CYCLE)
     return arming.text
@@ -54,7 +55,7 @@ def disarmed(board, arming):
 def in_flight(bench):
     board, arming = bench
     assert disarmed(board, arming) == 'ready'
-    arming.follow('takeoff')
+    arming.follow(Mode('takeoff'))
     assert arming.phase == 'arms' and board.asked is True
     arming.update(CYCLE)
     assert arming.phase == 'arms'
@@ -73,7 +74,7 @@ def test_arming_waits_for_board_and_supervisor_and_names_which(bench):
     assert arming.text == 'waiting: battery low'
     board.state.status = DISARMED
     assert arming.text == 'waiting: no message from the supervisor'
-    arming.follow('disarmed')
+    arming.follow(Mode('disarmed'))
     assert arming.text == 'waiting: disarming is not confirmed yet'
     board.answer()
     arming.update(CYCLE)
@@ -84,11 +85,11 @@ def test_arming_waits_for_board_and_supervisor_and_names_which(bench):
 def test_arming_follows_the_supervisor_and_disarming_is_repeated_until_confirmed(bench, stop):
     board, arming = in_flight(bench)
     for state in ('flying:nmpc', 'fallback', 'landing'):
-        arming.follow(state)
+        arming.follow(Mode(state))
         arming.update(CYCLE)
         assert arming.phase == 'flies'
     asked = len(board.commands)
-    arming.follow(stop)
+    arming.follow(Mode(stop))
     assert arming.phase == 'rests' and board.asked is False and len(board.commands) == asked + 1
     arming.update(CYCLE)
     assert len(board.commands) == asked + 1     # an answer may still come
@@ -103,8 +104,8 @@ def test_arming_follows_the_supervisor_and_disarming_is_repeated_until_confirmed
 
 def test_a_refusal_to_arm_is_reported_and_not_retried(bench):
     board, arming = bench
-    arming.follow('disarmed')
-    arming.follow('takeoff')
+    arming.follow(Mode('disarmed'))
+    arming.follow(Mode('takeoff'))
     board.answer(False, 'refused by the board: battery low')
     arming.update(CYCLE)
     assert arming.text == 'lost: not armed: refused by the board: battery low'
@@ -135,12 +136,12 @@ def test_a_board_that_stopped_in_flight_is_lost_until_the_supervisor_is_disarmed
     arming.update(CYCLE)
     assert len(board.commands) == asked + 1 and board.asked is False
     for state in ('flying:nmpc', 'emergency_stop'):
-        arming.follow(state)
+        arming.follow(Mode(state))
         board.answer()
         arming.update(CYCLE)
         assert arming.text == f'lost: {why}' and board.asked is False
     assert disarmed(board, arming) == 'ready'
-    arming.follow('takeoff')
+    arming.follow(Mode('takeoff'))
     assert board.asked is True
 
 
@@ -170,9 +171,9 @@ def test_a_silent_board_is_reported_after_a_timeout_that_excludes_own_pauses(
 
 def test_arming_in_flight_never_happens(bench):
     board, arming = bench
-    arming.follow('flying:nmpc')
+    arming.follow(Mode('flying:nmpc'))
     assert arming.text == 'lost: the supervisor was not disarmed before'
     for state in ('disarmed', 'emergency_stop', 'takeoff'):
-        arming.follow(state)
+        arming.follow(Mode(state))
     assert arming.text == 'lost: the supervisor was not disarmed before'
     assert board.asked is False

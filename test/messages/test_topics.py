@@ -12,6 +12,7 @@ from beetle_omni_ros.messages.topics import ALL
 from beetle_omni_ros.messages.values import Diagnostic, MessageError, Odom, Wrench
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.mode import Mode
 from beetle_omni_ros.robot.readings import (
     BatteryReading,
     ImuReading,
@@ -44,7 +45,7 @@ def value(topic, seed=0, stamp=STAMP):
         ActuatorHealth: lambda: ActuatorHealth(
             (True, False, True, True), (None, 0.5, None, None), thrust_limit=8.75),
         Wrench: lambda: Wrench(stamp, draw(size=3), draw(size=3)),
-        str: lambda: 'flying:nmpc',
+        str: lambda: 'waiting', Mode: lambda: Mode('flying:nmpc'),
         Diagnostic: lambda: [Diagnostic(stamp, 'ekf_node: inputs', 2, 'silent', {'a': '1'}),
                              Diagnostic(stamp, 'ekf_node: compute', 0, 'well')]}
     return made[ALL[topic].value]()

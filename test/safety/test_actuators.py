@@ -98,7 +98,7 @@ def test_without_their_bridge_the_joints_count_as_stopped_where_they_were():
     rig.alive.discard('joints')
     rig.velocity = np.array([0.3, 0.0, 0.0])
     rig.run(0.3)
-    assert rig.supervisor.reported_state == 'landing:joint_bridge_lost'
+    assert rig.supervisor.mode == 'landing:joint_bridge_lost'
     assert any(text.startswith('joint_bridge_node silent for') for text in rig.texts('error'))
     assert np.abs(rig.command.tilt - angles).max() > 0.01
     assert np.array_equal(rig.supervisor.seen.tilt, angles)

@@ -20,7 +20,7 @@ def test_an_impact_near_the_floor_stops_the_motors_for_good():
         rig.supervisor.on_imu(rig.now + after, np.array([0, 0, 120.0]), np.zeros(3))
     sent = rig.run(0.1)
     assert rig.supervisor.state == 'emergency_stop'
-    assert rig.supervisor.reported_state == 'emergency_stop:crash'
+    assert rig.supervisor.mode == 'emergency_stop:crash'
     assert not sent[0].thrust.any()
     assert not rig.supervisor.arm(rig.now)
 
@@ -63,7 +63,7 @@ def test_silent_joints_that_act_beside_their_commands_stop_the_motors():
     rig.alive.discard('joints')
     rig.velocity = np.array([0.0, 0.0, -0.3])
     rig.run(1.0)
-    assert rig.supervisor.reported_state == 'landing:joints_lost'
+    assert rig.supervisor.mode == 'landing:joints_lost'
     follows = rig._specific_force
     rig._specific_force = lambda tilt: follows(tilt + [1.0, 1.0, -1.0, -1.0])
     rig.run(0.2)

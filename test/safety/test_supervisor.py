@@ -124,7 +124,7 @@ def test_commands_that_stay_late_fall_back_with_the_reason_until_they_are_punctu
     rig.run(0.1)
     assert rig.supervisor.state == 'flying'
     rig.run(0.2)
-    assert rig.supervisor.reported_state == 'fallback:commands_late'
+    assert rig.supervisor.mode == 'fallback:commands_late'
     assert any('nmpc_node late: median age 30 ms' in text for text in rig.texts('error'))
     rig.run(2.0)
     assert rig.supervisor.state == 'fallback'
@@ -133,14 +133,14 @@ def test_commands_that_stay_late_fall_back_with_the_reason_until_they_are_punctu
     rig.run(RETURN_AFTER)
     assert rig.supervisor.state == 'fallback'
     rig.run(0.3)
-    assert rig.supervisor.reported_state == 'flying:nmpc'
+    assert rig.supervisor.mode == 'flying:nmpc'
 
 
 def test_late_estimates_are_named_although_the_commands_that_answer_them_are_late_too():
     rig = flown()
     rig.age = dict.fromkeys(rig.age, 0.03)
     rig.run(0.3)
-    assert rig.supervisor.reported_state == 'fallback:estimates_late'
+    assert rig.supervisor.mode == 'fallback:estimates_late'
 
 
 def test_single_late_commands_have_no_effect():
@@ -285,7 +285,7 @@ def test_a_tumbling_or_falling_robot_falls_back(motion):
     rig.run(LOST_TIME - 0.02)
     assert rig.supervisor.state == 'flying'
     rig.run(0.6)
-    assert rig.supervisor.reported_state == 'fallback:control_lost'
+    assert rig.supervisor.mode == 'fallback:control_lost'
 
 
 def test_a_clock_set_back_in_flight_is_tolerated():

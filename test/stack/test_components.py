@@ -10,6 +10,7 @@ from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.mode import Mode
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import ImuReading, JointReading, PoseReading
 from beetle_omni_ros.runs.tasks import make_task
@@ -170,7 +171,7 @@ def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets
     now = follower.time
     assert target().position[0] == 4.0 and target().stamp == now
     for mode in ('flying:nmpc', 'disarmed'):
-        follower.component.feed('supervisor/state', mode)
+        follower.component.feed('supervisor/state', Mode(mode))
     assert follower.component.stepper.controller.resets == 1
 
 
@@ -180,7 +181,7 @@ def test_a_bad_target_is_refused_with_its_reason_and_the_old_one_stays(follower)
     fly(follower, 100.0)
     aim(follower, 0.0, 100.0, published=100.0)
     first = stepper.target
-    follower.component.feed('supervisor/state', 'flying:nmpc')
+    follower.component.feed('supervisor/state', Mode('flying:nmpc'))
     for change, expected in (
             ({'z': -5.0}, 'z = -5 m, expected at least'),
             ({'x': 12.0}, '12 m from the robot, expected at most 6.5 m'),
@@ -248,7 +249,7 @@ def reference():
         desk = Desk(Reference(make_task(name), lambda mass: None), 1999.99)
         proceed(desk)
         assert len(desk.sent) == 1      # 'waiting'
-        desk.component.feed('supervisor/state', 'flying:nmpc')
+        desk.component.feed('supervisor/state', Mode('flying:nmpc'))
         return desk
 
     return build
@@ -271,7 +272,7 @@ def test_the_reference_starts_the_task_in_flight_and_a_landing_aborts_it(referen
         pass
     assert np.allclose(desk.stamps('target_pose'), 2000 + 8 * np.arange(15))
     assert desk.values('reference/state')[:2] == ['waiting', 'flying 1/15']
-    desk.component.feed('supervisor/state', 'landing')
+    desk.component.feed('supervisor/state', Mode('landing'))
     assert desk.component.state == 'aborted'
 
 
