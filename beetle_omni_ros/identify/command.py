@@ -122,7 +122,7 @@ def run_identify_robot(paths: Sequence[Path], params: Path, *, rate: float | Non
     servo = rotor = model = None
     if joints:
         with console.status('identifying the servos'):
-            found = identify(joints, robot_parameters, one_delay=True)
+            found = identify(joints, robot_parameters, as_file=True)
             servo = servo_values(found, robot_parameters)
         results['servos'] = joint_results(found, [], robot_parameters)
         print_grids(of_joints.grids(results['servos']), console)

@@ -91,7 +91,8 @@ TERMS = {
                         words='load (cosine)'),
     # Errors of the reading: gain q + sine sin q + cosine (cos q - 1). The harmonics are those of
     # an encoder whose axis is off the joint's.
-    'encoder_gain': Term('1', 0.0, -0.3, 0.3, 0.002, Spread(0.0, {'joint': 0.02}), in_step=False),
+    'encoder_gain': Term('1', 0.0, -0.3, 0.3, 0.002, Spread(0.0, {'joint': 0.02}),
+                         words='gain of the reading', in_step=False),
     'encoder_sine': Term('rad', 0.0, -0.3, 0.3, 0.002, Spread(0.0, {'joint': 0.02}),
                          in_step=False),
     'encoder_cosine': Term('rad', 0.0, -0.3, 0.3, 0.002, Spread(0.0, {'joint': 0.02}),
