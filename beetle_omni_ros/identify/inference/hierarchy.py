@@ -169,7 +169,7 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray,
     inside = log_integral(h, g, rows, room)
     prior = log_integral(np.eye(size), np.zeros(size), rows, limits)
 
-    def without(part):
+    def without(part) -> tuple[np.ndarray, np.ndarray]:
         return h - matrices[part].sum(axis=0), g - scores[:, part].sum(axis=(0, 1))
 
     held = [-chi2[part].sum() / 2 + inside - log_integral(*without(part), rows, room)

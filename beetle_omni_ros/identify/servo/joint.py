@@ -8,7 +8,6 @@ import numpy as np
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.inference.hierarchy import WIDTH
-from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.fit import (
     ENTRIES,
     error_rms,
@@ -30,6 +29,8 @@ SERVO = 'joint_bandwidth', 'joint_command_latency', 'joint_friction', 'joint_off
 # ... and the gain of a line. Without it, the damping takes up an error of 1 % of the amplitude of
 # a slow motion, and predicts one of 10 % at three times its rate.
 GAIN = 'reading_gain'
+LOOSE = 1.5         # half width of an interval, in scales, below which no pair is reported
+TRADED = 0.6        # least correlation of a pair that a log does not separate
 DELAYS = np.arange(0.0, 0.12, 5e-4)     # [s] of a line
 
 
@@ -105,8 +106,7 @@ def joint_results(found: Found, validations: Sequence[JointLog], robot: RobotPar
               for unit, (k, *_) in enumerate(found.servos.units) if k == 0]
     return {'meta': {'log': log.name, 'logs': [each.name for each in found.servos.logs],
                      'validate': [other.name for other in validations],
-                     'fitted_part': shipped().servo.fitted, 'converged': bool(fit.converged),
-                     'version': __version__},
+                     'converged': bool(fit.converged), 'version': __version__},
             'joints': joints, 'text': _merged(joints)}
 
 
@@ -143,9 +143,7 @@ def _joint(found, unit, validations, robot):
             None if k is None else error_rms(other, k, file, is_held) for other, k in known],
         'terms': _terms(found, unit), 'traded': traded,
         'text': sentences(found, unit, traded, best),
-        'experiment': separating_sine(),
-        'derived': {'inertia_kg_m2': robot.joints.inertia,
-                    'kp_N_m_per_rad': derived['joint_bandwidth']['kp'],
+        'derived': {'kp_N_m_per_rad': derived['joint_bandwidth']['kp'],
                     'kd_N_m_s_per_rad': derived['joint_bandwidth']['kd'],
                     'coulomb_friction_N_m': derived['joint_friction']['coulomb']}}
 
@@ -170,16 +168,9 @@ def inseparable(found: Found, unit: int) -> list[list[str]]:
     scale = np.array([term.scale for term in TERMS.values()])
     deviation = np.sqrt(np.diag(covariance))
     loose = [p for p in np.flatnonzero(mask(found.chosen.entries))
-             if WIDTH * deviation[p] > shipped().servo.loose * scale[p]]
+             if WIDTH * deviation[p] > LOOSE * scale[p]]
     return [sorted([NAMES[p], NAMES[o]]) for k, p in enumerate(loose) for o in loose[k + 1:]
-            if abs(covariance[p, o]) > shipped().servo.traded * deviation[p] * deviation[o]]
-
-
-def separating_sine() -> dict[str, float]:
-    """Log that separates delay and bandwidth: several reversals a second below the speed limit."""
-    p = shipped().servo
-    return {'frequency_Hz': p.sine_speed / (2 * np.pi * p.sine_amplitude),
-            'amplitude_rad': p.sine_amplitude, 'duration_s': p.sine_time}
+            if abs(covariance[p, o]) > TRADED * deviation[p] * deviation[o]]
 
 
 def sentences(found: Found, unit: int, traded: list[list[str]], best: str) -> list[str]:
@@ -192,8 +183,7 @@ def sentences(found: Found, unit: int, traded: list[list[str]], best: str) -> li
         text.append(f'This log does not separate {"; ".join(pairs)}: larger and smaller values '
                     'predict it equally well.')
     if ['delay', 'natural_frequency'] in traded:
-        text.append('To separate delay and bandwidth, log a {frequency_Hz:.1f} Hz sine of '
-                    '{amplitude_rad:.2f} rad for {duration_s:g} s.'.format(**separating_sine()))
+        text.append('To separate delay and bandwidth, log a 3.8 Hz sine of 0.25 rad for 10 s.')
     unmet = [name for entry in LIMITS if entry not in found.chosen.entries
              for name in ENTRIES[entry]]
     if unmet:

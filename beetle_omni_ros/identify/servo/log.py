@@ -7,13 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.runs.files import LogError, missing, read_table
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
 JOINTS = (1, 2, 3, 4)
 NEIGHBOURS = 5      # readings on each side that determine the time of one
+FITTED = 0.6        # share of a log; the rest is for validation
+PERIODS = 2e-4, 0.1     # [s] between samples; slower sampling cannot resolve a servo
+LONGEST_GAP = 0.25      # [s]
+LEAST_DURATION = 2.0    # [s]
+LEAST_SAMPLES = 100
+LEAST_TRAVEL = 0.02     # [rad] of the command and of each joint
+LARGEST_ANGLE = 13.0    # [rad] two turns; a larger value is not in radians
+HISTORY = 0.3           # [s] before the log, in which the command is extrapolated
+LONGEST_BAG = 30.0      # [s] used of a bag; more takes minutes and adds little information
+LAST_COMMAND = 0.1      # [s] for which the actuators execute the last command
 
 
 @dataclass(frozen=True)
@@ -56,7 +65,7 @@ class JointLog:
         read_t[fresh] = reading_times(self.t[fresh], period)
         first = np.polyfit(read_t[used] - self.t[0], self.measured[:, used].T, 2)
         slope = np.polyfit(self.t[:count] - self.t[0], self.command[:, :count].T, 1)[0]
-        back = -period * np.arange(int(shipped().log.history / period) + 1, 0, -1)
+        back = -period * np.arange(int(HISTORY / period) + 1, 0, -1)
         before = self.command[:, :1] + slope[:, None] * back
         command_t = np.concatenate([self.t[0] + back, self.t])
         command = np.concatenate([before, self.command], axis=1)
@@ -82,7 +91,7 @@ class JointLog:
     @property
     def end(self) -> int:
         """Number of samples of the fitted part; the others are held out."""
-        return int(round(shipped().servo.fitted * len(self.t)))
+        return int(round(FITTED * len(self.t)))
 
     def first(self) -> JointLog:
         """The fitted part of the log."""
@@ -224,38 +233,36 @@ def _wanted(header):
 
 
 def _check_times(path, t, rows):
-    p = shipped().log
-    if len(t) < p.least_samples:
+    if len(t) < LEAST_SAMPLES:
         raise LogError(f'{path}: {len(t)} rows are too few; expected at least '
-                       f'{p.least_samples}')
+                       f'{LEAST_SAMPLES}')
     steps = np.diff(t)
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0)) + 1
         raise LogError(f'{path}: row {rows[k]}, column t_s: {t[k]:g} s does not come after '
                        f'{t[k - 1]:g} s; expected increasing times')
     period = float(np.median(steps))
-    if not p.periods[0] <= period <= p.periods[1]:
+    if not PERIODS[0] <= period <= PERIODS[1]:
         raise LogError(f'{path}: column t_s: samples are {period:g} s apart; expected '
-                       f'{p.periods[0]:g} to {p.periods[1]:g} s (is the time in '
+                       f'{PERIODS[0]:g} to {PERIODS[1]:g} s (is the time in '
                        'seconds?)')
-    if t[-1] - t[0] < p.least_duration:
+    if t[-1] - t[0] < LEAST_DURATION:
         raise LogError(f'{path}: {t[-1] - t[0]:.2f} s are too short; expected at least '
-                       f'{p.least_duration:g} s')
-    if steps.max() > p.longest_gap:
+                       f'{LEAST_DURATION:g} s')
+    if steps.max() > LONGEST_GAP:
         k = int(np.argmax(steps)) + 1
         raise LogError(f'{path}: row {rows[k]}: {steps.max():.2f} s without a sample; '
-                       f'expected gaps below {p.longest_gap:g} s (split the log there)')
+                       f'expected gaps below {LONGEST_GAP:g} s (split the log there)')
 
 
 def _check_angles(path, joint, position, command):
-    p = shipped().log
     for name, values in (('the command', command), (f'q{joint}_rad', position)):
-        if np.abs(values).max() > p.largest_angle:
+        if np.abs(values).max() > LARGEST_ANGLE:
             raise LogError(f'{path}: {name} reaches {np.abs(values).max():g}; expected radians '
-                           f'within +-{p.largest_angle:g} (degrees or encoder counts?)')
-        if np.ptp(values) < p.least_travel:
+                           f'within +-{LARGEST_ANGLE:g} (degrees or encoder counts?)')
+        if np.ptp(values) < LEAST_TRAVEL:
             raise LogError(f'{path}: {name} moves by {np.ptp(values):.4f} rad only; expected at '
-                           f'least {p.least_travel:g} rad (a constant does not identify a '
+                           f'least {LEAST_TRAVEL:g} rad (a constant does not identify a '
                            'servo)')
     ratio = np.ptp(position) / np.ptp(command)
     if not 0.1 < ratio < 10:
@@ -277,7 +284,7 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Returns:
         (N,) times from the first [s], (4, N) positions [rad], (4, N) commands [rad], of the
-        longest interval with commands; of a long one, the part of ``longest_bag`` with most
+        longest interval with commands; of a long one, the part of ``LONGEST_BAG`` with most
         motion.
 
     Raises:
@@ -296,7 +303,7 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     fresh = np.r_[True, np.diff(log.joint_t) > 0]
     t, position = log.joint_t[fresh], log.joint_position[fresh]
     last = np.searchsorted(received, t, side='right') - 1
-    driven = (last >= 0) & (t - received[np.maximum(last, 0)] <= shipped().log.last_command)
+    driven = (last >= 0) & (t - received[np.maximum(last, 0)] <= LAST_COMMAND)
     edges = np.flatnonzero(np.diff(np.r_[False, driven, False].astype(int)))
     stretches = edges.reshape(-1, 2)
     if not len(stretches):
@@ -309,9 +316,8 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _most_motion(t, command, first, end):
-    """The part of an interval, at most ``longest_bag`` long, in which the commands travel most."""
-    longest = shipped().log.longest_bag
-    ends = np.minimum(np.searchsorted(t, t[first:end] + longest, side='right'), end)
+    """The part of an interval, at most ``LONGEST_BAG`` long, in which the commands travel most."""
+    ends = np.minimum(np.searchsorted(t, t[first:end] + LONGEST_BAG, side='right'), end)
     travel = np.cumsum(np.r_[0.0, np.abs(np.diff(command[:end], axis=0)).sum(axis=1)])
     gain = travel[ends - 1] - travel[first:end]
     begin = first + int(np.argmax(gain))

@@ -21,7 +21,6 @@ import numpy as np
 from beetle_omni_ros.identify.inference.hierarchy import Spread
 from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.robot.native import built, EXACT, generated
-from beetle_omni_ros.robot.parameters import JointParameters
 from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.robot.servo import CASADI, play, Servo, Step
 
@@ -123,16 +122,6 @@ void servo_run(long steps, long sets, double step, const double *command, const 
     }
 }
 """
-
-
-def published_set(joint: JointParameters) -> np.ndarray:
-    """Parameter set of a robot file's joint: second order with limits."""
-    values = OFF.copy()
-    values[INDEX['natural_frequency']] = joint.natural_frequency
-    values[INDEX['damping_ratio']] = joint.damping_ratio
-    values[INDEX['velocity_limit']] = joint.velocity_limit
-    values[INDEX['torque_limit']] = joint.effort_limit / joint.kp
-    return values
 
 
 def simulate(log: JointLog, joint: np.ndarray | int, sets: np.ndarray,

@@ -8,9 +8,8 @@ import matplotlib
 from matplotlib.figure import Figure
 
 from beetle_omni_ros.identify.flights.page import head
-from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.fit import Found
-from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
+from beetle_omni_ros.identify.servo.log import FITTED, JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.identify.servo.robot import file_sets, held
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
@@ -110,7 +109,7 @@ def _figure(log, models, robot, fitted) -> Figure:
         right.set_ylabel('error [mrad]')
         if fitted:
             for axis in (left, right):
-                axis.axvspan(0, shipped().servo.fitted * t[-1], color='#eef3f8', lw=0)
+                axis.axvspan(0, FITTED * t[-1], color='#eef3f8', lw=0)
     for axis in axes[-1]:
         axis.set_xlabel('time [s]')
     legend(figure, axes[0, 1])
