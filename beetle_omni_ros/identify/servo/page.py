@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import matplotlib
 from matplotlib.figure import Figure
+import numpy as np
 
 from beetle_omni_ros.identify.flights.page import head
 from beetle_omni_ros.identify.servo.fit import Found
@@ -61,13 +62,26 @@ def _value(term):
     return f'{value},\n{low}..{high}'      # two lines: four joints fit into 80 columns
 
 
+def flown_errors(logs: Sequence[JointLog], robots: dict[str, RobotParameters]) -> Grid:
+    """Errors of robots as the simulator flies them, behind its delays and with the logs' zeros."""
+    rows = []
+    for log in logs:
+        for name, robot in robots.items():
+            sets = file_sets(robot, flown=True)[np.array(log.joints) - 1]
+            error = simulate(log, np.arange(len(sets)), sets) - log.measured
+            rows.append([f'{log.name}, {name}', *(f'{MILLI * np.std(one[log.fresh]):.1f}'
+                                                  for one in error)])
+    return Grid('RMS error of the servos as simulated, without zeros [mrad]',
+                ['', *(f'joint {number}' for number in logs[0].joints)], rows)
+
+
 def joint_page(found: Found, validations: Sequence[JointLog], robot: RobotParameters,
                results: dict) -> str:
     """HTML page about an identification."""
     logs = found.servos.logs
     names = ', '.join(each.name for each in logs)
     return page('Tilt servos', f'identified from {names}', grids(results), results['text'],
-                _sections(found, validations, robot))
+                joint_sections(found, validations, robot))
 
 
 def gap_log_page(apart: Found, result: dict, tables: Sequence[Grid], robot: RobotParameters
@@ -77,10 +91,10 @@ def gap_log_page(apart: Found, result: dict, tables: Sequence[Grid], robot: Robo
                                                 *result['meta']['holdout']]]
     return page('Tilt servos', f'{apart.servos.logs[0].name} against the robot file',
                 [*tables, *grids(result | {'meta': {'validate': [o.name for o in others]}})],
-                result['text'], _sections(apart, others, robot), head(result, ''))
+                result['text'], joint_sections(apart, others, robot), head(result, ''))
 
 
-def _sections(found, others, robot):
+def joint_sections(found: Found, others: Sequence[JointLog], robot: RobotParameters) -> list[str]:
     """A section with responses and errors of each log."""
     logs = found.servos.logs
     models = dict(zip(logs[0].joints, found.of_log(0), strict=True))
