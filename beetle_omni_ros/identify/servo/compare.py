@@ -23,7 +23,7 @@ from beetle_omni_ros.identify.servo.joint import identify, joint_results
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX, NAMES, with_encoder_errors
 from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
-from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag import BagError, read_messages
 
@@ -160,7 +160,6 @@ def _effects(found, robot):
         rivals = _rivals(found, name)
         effect = {'names': [name, *rivals], 'layer': 'joint', 'evidence': _evidence(found, name)}
         if rivals:
-            effect['separated_by'] = separating_experiment(effect['names'])
             effect['rivals'] = [{'name': rival, 'gain': found.gains.get(rival, 0.0),
                                  'evidence': _evidence(found, rival),
                                  'parameters': _parameters(found, found.trials[rival], rival,

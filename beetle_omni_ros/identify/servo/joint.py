@@ -176,9 +176,7 @@ def inseparable(found: Found, unit: int) -> list[list[str]]:
 def sentences(found: Found, unit: int, traded: list[list[str]], best: str) -> list[str]:
     """Inseparable pairs, proposed log, limits that were not reached, and a better line."""
     text = []
-    pairs = [' and '.join(
-        f'{TERMS[name].words or name} {_range(name, interval(found, found.chosen, unit, name))}'
-        for name in pair) for pair in traded]
+    pairs = [' and '.join(TERMS[name].words or name for name in pair) for pair in traded]
     if pairs:
         text.append(f'This log does not separate {"; ".join(pairs)}: larger and smaller values '
                     'predict it equally well.')
@@ -196,12 +194,6 @@ def sentences(found: Found, unit: int, traded: list[list[str]], best: str) -> li
                     'the servo model and gives the errors above: the log does not determine the '
                     'servo. Log all its angles, in both directions, twice.')
     return text
-
-
-def _range(name, ends):
-    if name == 'delay':
-        return f'({1e3 * ends[0]:.0f} to {1e3 * ends[1]:.0f} ms)'
-    return f'({ends[0]:.3g} to {ends[1]:.3g} {TERMS[name].unit})'.replace(' 1)', ')')
 
 
 def _merged(joints):

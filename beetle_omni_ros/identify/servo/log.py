@@ -194,42 +194,31 @@ def read_joint_log(path: str | Path) -> JointLog:
 
     """
     if is_bag(Path(path)):
+        joints = JOINTS
         t, measured, command = read_bag_response(Path(path))
-        _check_times(path, t, np.arange(1, len(t) + 1))
-        for k, position, wanted in zip(JOINTS, measured, command, strict=True):
-            _check_angles(path, k, position, wanted)
-        return JointLog(Path(path).name, t, JOINTS, measured, command)
-    columns, rows = read_table(path, _wanted, HEADER)
-    t = columns['t_s']
+        rows = np.arange(1, len(t) + 1)
+    else:
+        columns, rows = read_table(path, _wanted, HEADER)
+        t = columns['t_s']
+        joints = tuple(k for k in JOINTS if f'q{k}_rad' in columns)
+        measured = np.stack([columns[f'q{k}_rad'] for k in joints])
+        command = np.stack([columns[own if (own := f'command{k}_rad') in columns
+                                    else 'command_rad'] for k in joints])
     _check_times(path, t, rows)
-    joints = tuple(k for k in JOINTS if f'q{k}_rad' in columns)
-    measured = np.stack([columns[f'q{k}_rad'] for k in joints])
-    command = np.stack([columns[own if (own := f'command{k}_rad') in columns
-                                      else 'command_rad'] for k in joints])
     for k, position, wanted in zip(joints, measured, command, strict=True):
         _check_angles(path, k, position, wanted)
     return JointLog(Path(path).name, t, joints, measured, command)
 
 
 def _wanted(header):
-    if 't_s' not in header:
-        raise missing('t_s', header)
-    joints = [k for k in JOINTS if f'q{k}_rad' in header]
-    if not joints:
-        raise missing('q1_rad', header)
-    odd = [cell for cell in header if cell[:1] == 'q' and cell[1:2].isdigit()
-           and cell not in [f'q{k}_rad' for k in JOINTS]]
-    if odd:
-        raise LogError(f"column '{odd[0]}' is not one of q1_rad to q4_rad")
-    names = ['t_s', *(f'q{k}_rad' for k in joints)]
-    if 'command_rad' in header:
-        return [*names, 'command_rad']
-    if not any(f'command{k}_rad' in header for k in joints):
-        raise missing('command_rad', header)
-    for k in joints:
-        if f'command{k}_rad' not in header:
-            raise missing(f'command{k}_rad', header)
-    return names + [f'command{k}_rad' for k in joints]
+    joints = [k for k in JOINTS if f'q{k}_rad' in header] or JOINTS[:1]
+    own = any(f'command{k}_rad' in header for k in joints) and 'command_rad' not in header
+    names = ['t_s', *(f'q{k}_rad' for k in joints),
+             *([f'command{k}_rad' for k in joints] if own else ['command_rad'])]
+    for name in names:
+        if name not in header:
+            raise missing(name, header)
+    return names
 
 
 def _check_times(path, t, rows):
