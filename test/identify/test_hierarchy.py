@@ -25,17 +25,17 @@ ALL = np.ones(3, dtype=bool)
 class Linear:
     """Units with the signals A (U, P, n) theta plus noise of deviation SIGMA."""
 
-    def __init__(self, seed, active=ALL, noise=None, count=COUNT):
+    def __init__(self, seed, active=ALL):
         rng = np.random.default_rng(seed)
-        t, units = np.linspace(0, 2 * np.pi, count), len(JOINTS)
+        t, units = np.linspace(0, 2 * np.pi, COUNT), len(JOINTS)
         phases = rng.uniform(0, 2 * np.pi, (units, 3, 1))
         self.a = np.sin(np.array([3.0, 5.0, 8.0])[:, None] * t + phases)
         self.base = np.tile([1.0, -2.0, 0.5], (units, 1))
         s = design(SPREADS, LABELS, active)
         self.truth = self.base + s @ rng.standard_normal(s.shape[2])
-        noise = rng.uniform(-1.7, 1.7, (units, count)) if noise is None else noise(rng, units)
-        self.y = np.einsum('upn,up->un', self.a, self.truth) + SIGMA * noise
-        self.block = np.arange(count) * BLOCKS // count
+        self.y = np.einsum('upn,up->un', self.a, self.truth) + SIGMA * rng.uniform(
+            -1.7, 1.7, (units, COUNT))
+        self.block = np.arange(COUNT) * BLOCKS // COUNT
 
     def __call__(self, theta, active):
         r = (np.einsum('upn,up->un', self.a, theta) - self.y) / SIGMA
@@ -67,10 +67,6 @@ class Linear:
         y = self.y[:, rows].ravel() - a @ self.base.ravel()
         gain = c @ a.T @ np.linalg.inv(a @ c @ a.T + SIGMA**2 * np.eye(len(y)))
         return self.base + (gain @ y).reshape(self.base.shape), c - gain @ a @ c
-
-
-def white(rng, units):
-    return rng.standard_normal((units, 300))
 
 
 @pytest.mark.parametrize('active', [(1, 1, 1), (1, 0, 1), (0, 1, 0), (0, 0, 0)])

@@ -326,12 +326,9 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
     def gain(trial):
         return trial.fit.evidence
 
-    while True:
-        trials = {name: servos.fit([*chosen.entries, name], starts=(chosen, full))
-                  for name in candidates if name not in chosen.entries}
-        better = [trial for trial in trials.values() if worth(trial, chosen)]
-        if not better:
-            break
+    while better := [trial for trial in (
+            servos.fit([*chosen.entries, name], starts=(chosen, full))
+            for name in candidates if name not in chosen.entries) if worth(trial, chosen)]:
         chosen = max(better, key=gain)
     while True:
         without = {name: servos.fit([other for other in chosen.entries if other != name],

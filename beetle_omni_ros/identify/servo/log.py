@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.runs.files import LogError, missing, read_table
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
-JOINTS = (1, 2, 3, 4)
+JOINTS: tuple[int, ...] = (1, 2, 3, 4)
 NEIGHBOURS = 5      # readings on each side that determine the time of one
 FITTED = 0.6        # share of a log; the rest is for validation
 PERIODS = 2e-4, 0.1     # [s] between samples; slower sampling cannot resolve a servo
@@ -36,8 +37,6 @@ class JointLog:
         joints: (n,) numbers of the joints, 1 to 4.
         measured: (n, N) encoder positions [rad].
         command: (n, N) commanded positions [rad].
-        fresh: (N,) rows with a new reading; the others repeat the last one.
-        read_t: (N,) times of the readings of fresh rows [s]; the others are nan.
 
     """
 
@@ -46,47 +45,56 @@ class JointLog:
     joints: tuple[int, ...]
     measured: np.ndarray
     command: np.ndarray
-    period: float = field(init=False)
-    fresh: np.ndarray = field(init=False)
-    read_t: np.ndarray = field(init=False)
-    start: np.ndarray = field(init=False)
-    start_velocity: np.ndarray = field(init=False)
-    _command_t: np.ndarray = field(init=False, repr=False)
-    _command: np.ndarray = field(init=False, repr=False)
-    _total: np.ndarray = field(init=False, repr=False)
 
-    def __post_init__(self):
-        """Derive sampling period [s], first positions [rad] and velocities [rad/s]."""
-        period = float(np.median(np.diff(self.t)))
-        count = max(4, int(round(0.04 / period)) + 1)
-        fresh = fresh_rows(self.measured)
-        used = np.flatnonzero(fresh)[:max(4, int(fresh[:count].sum()))]
-        read_t = np.full(len(self.t), np.nan)
-        read_t[fresh] = reading_times(self.t[fresh], period)
-        first = np.polyfit(read_t[used] - self.t[0], self.measured[:, used].T, 2)
-        slope = np.polyfit(self.t[:count] - self.t[0], self.command[:, :count].T, 1)[0]
-        back = -period * np.arange(int(HISTORY / period) + 1, 0, -1)
-        before = self.command[:, :1] + slope[:, None] * back
-        command_t = np.concatenate([self.t[0] + back, self.t])
-        command = np.concatenate([before, self.command], axis=1)
-        total = np.cumsum(command[:, :-1] * np.diff(command_t), axis=1)
-        total = np.concatenate([np.zeros((len(command), 1)), total], axis=1)
-        known = {'_total': total, 'period': period, 'fresh': fresh,
-                 'read_t': read_t, 'start': first[2], 'start_velocity': first[1],
-                 '_command_t': command_t, '_command': command}
-        for name, value in known.items():
-            object.__setattr__(self, name, value)
+    @cached_property
+    def period(self) -> float:
+        """Time between rows [s]."""
+        return float(np.median(np.diff(self.t)))
+
+    @cached_property
+    def fresh(self) -> np.ndarray:
+        """(N,) rows with a new reading; the others repeat the last one."""
+        return fresh_rows(self.measured)
+
+    @cached_property
+    def read_t(self) -> np.ndarray:
+        """(N,) times of the readings of fresh rows [s]; the others are nan."""
+        times = np.full(len(self.t), np.nan)
+        times[self.fresh] = reading_times(self.t[self.fresh], self.period)
+        return times
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """(2, n) first positions [rad] and velocities [rad/s]."""
+        used = np.flatnonzero(self.fresh)[:max(4, int(self.fresh[:self._first].sum()))]
+        return np.polyfit(self.read_t[used] - self.t[0], self.measured[:, used].T, 2)[:0:-1]
+
+    @property
+    def _first(self) -> int:
+        """Number of rows of the first 40 ms."""
+        return max(4, int(round(0.04 / self.period)) + 1)
+
+    @cached_property
+    def _commands(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times (M,), commands (n, M) with a straight line before the log, their integrals."""
+        slope = np.polyfit(self.t[:self._first] - self.t[0], self.command[:, :self._first].T, 1)[0]
+        back = -self.period * np.arange(int(HISTORY / self.period) + 1, 0, -1)
+        t = np.concatenate([self.t[0] + back, self.t])
+        command = np.concatenate([self.command[:, :1] + slope[:, None] * back, self.command], 1)
+        total = np.cumsum(command[:, :-1] * np.diff(t), axis=1)
+        return t, command, np.concatenate([np.zeros((len(command), 1)), total], axis=1)
 
     def command_at(self, joint: int, times: np.ndarray) -> np.ndarray:
         """Command of a joint (index) by linear interpolation [rad]; linear before the log."""
-        return np.interp(times, self._command_t, self._command[joint])
+        t, command, _ = self._commands
+        return np.interp(times, t, command[joint])
 
     def held_command(self, joint: int, edges: np.ndarray) -> np.ndarray:
         """Means (K,) over the steps between ``edges`` (K + 1,) of the command held until a row."""
-        row = np.maximum(np.searchsorted(self._command_t, edges, side='right') - 1, 0)
-        total = self._total[joint, row] + self._command[joint, row] * (
-            edges - self._command_t[row])
-        return np.diff(total) / np.diff(edges)
+        t, command, total = self._commands
+        row = np.maximum(np.searchsorted(t, edges, side='right') - 1, 0)
+        integral = total[joint, row] + command[joint, row] * (edges - t[row])
+        return np.diff(integral) / np.diff(edges)
 
     @property
     def end(self) -> int:

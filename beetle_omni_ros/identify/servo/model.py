@@ -149,8 +149,7 @@ def simulate(log: JointLog, joint: np.ndarray | int, sets: np.ndarray,
     count = int(np.ceil((times.max() - log.t[0]) / step - 1e-6))
     value = dict(zip(NAMES, sets.T, strict=True))
     command = _commands(log, joint, value['delay'], log.t[0] + step * np.arange(count + 1), held)
-    positions = _integrate(value, command + value['offset'], log.start[joint],
-                           log.start_velocity[joint], step)
+    positions = _integrate(value, command + value['offset'], log.start[:, joint], step)
     return with_encoder_errors(_at_samples(positions, (times - log.t[0]) / step), value)
 
 
@@ -172,19 +171,19 @@ def _commands(log, joint, delay, edges, held):
     return np.stack(means, axis=1)[:, which.ravel()]
 
 
-def _integrate(value, command, q, v, step):
+def _integrate(value, command, start, step):
     """Positions (K + 1, B) of held commands (K, B)."""
     # Leapfrog: positions are half a step ahead of velocities.
-    middle, velocity = np.empty((2, len(command) + 1, len(q)))
-    middle[0], velocity[0] = q + 0.5 * step * v, v
+    middle, velocity = np.empty((2, len(command) + 1, start.shape[1]))
+    middle[0], velocity[0] = start[0] + 0.5 * step * start[1], start[1]
     numbers = np.ascontiguousarray([value[name] for name in STEP_TERMS])
     if (run := _compiled()) is not None:
         run(*command.shape, step, np.ascontiguousarray(command), numbers, middle, velocity)
     else:
-        advance = _advance().map(len(q))
+        advance = _advance().map(start.shape[1])
         for k, target in enumerate(command):
             middle[k + 1], velocity[k + 1] = (moved.full().ravel() for moved in advance(
-                *(row[None] for row in (target, middle[k], velocity[k], np.full(len(q), step),
+                *(row[None] for row in (target, middle[k], velocity[k], np.full(start.shape[1], step),
                                         *numbers))))
     positions = middle - 0.5 * step * velocity
     return play(positions, value['backlash']) if value['backlash'].any() else positions
