@@ -172,18 +172,19 @@ def _commands(log, joint, delay, edges, held):
 
 
 def _integrate(value, command, start, step):
-    """Positions (K + 1, B) of held commands (K, B)."""
+    """Positions (K + 1, B) of held commands (K, B) from positions and velocities (2, B)."""
     # Leapfrog: positions are half a step ahead of velocities.
-    middle, velocity = np.empty((2, len(command) + 1, start.shape[1]))
-    middle[0], velocity[0] = start[0] + 0.5 * step * start[1], start[1]
+    (q, v), count = start, command.shape[1]
+    middle, velocity = np.empty((2, len(command) + 1, count))
+    middle[0], velocity[0] = q + 0.5 * step * v, v
     numbers = np.ascontiguousarray([value[name] for name in STEP_TERMS])
     if (run := _compiled()) is not None:
         run(*command.shape, step, np.ascontiguousarray(command), numbers, middle, velocity)
     else:
-        advance = _advance().map(start.shape[1])
+        advance = _advance().map(count)
         for k, target in enumerate(command):
             middle[k + 1], velocity[k + 1] = (moved.full().ravel() for moved in advance(
-                *(row[None] for row in (target, middle[k], velocity[k], np.full(start.shape[1], step),
+                *(row[None] for row in (target, middle[k], velocity[k], np.full(count, step),
                                         *numbers))))
     positions = middle - 0.5 * step * velocity
     return play(positions, value['backlash']) if value['backlash'].any() else positions
