@@ -291,10 +291,6 @@ class Found:
         """(U, P) parameter sets of the units."""
         return decoded((trial or self.chosen).fit.theta)
 
-    def of_log(self, index: int, trial: Trial | None = None) -> np.ndarray:
-        """(J, P) parameter sets of the joints of one log."""
-        return self.values(trial)[np.array(self.servos.labels['log']) == index]
-
 
 def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least: float = 0.0,
            named: bool = False) -> Found:

@@ -97,7 +97,7 @@ def gap_log_page(apart: Found, result: dict, tables: Sequence[Grid], robot: Robo
 def joint_sections(found: Found, others: Sequence[JointLog], robot: RobotParameters) -> list[str]:
     """A section with responses and errors of each log."""
     logs = found.servos.logs
-    models = dict(zip(logs[0].joints, found.of_log(0), strict=True))
+    models = dict(zip(logs[0].joints, found.values(), strict=False))     # of the first log
     with matplotlib.rc_context(STYLE):
         return [section(
             other.name + (': fitted to the shaded part' if k < len(logs) else ': not fitted'),
