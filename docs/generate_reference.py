@@ -62,8 +62,6 @@ FILES = {
                        'The training for robots that differ.'),
     'train_published.yaml': ('train.parameters:TrainParameters',
                              'The training with the settings of the publication.'),
-    'identify.yaml': ('identify.parameters:IdentifyParameters',
-                      'Identification of servos and rotors from logs.'),
     'gap.yaml': ('identify.gap.parameters:GapParameters', 'The gap finder.')}
 
 ROBOT_FILE = """`mass`, `inertia` and `rotors.positions` are authoritative. With `multibody`, the

@@ -435,9 +435,7 @@ def robot(paths: Annotated[list[Path], Argument(metavar='LOG...', help=(
               'recognised by their header.'))],
           params: Annotated[Path, Option(
               callback=writable, metavar='FILE', help='The robot file to write.')],
-          rate: RateOption = None, robot: TheRobotOption = None,
-          picture: Annotated[Path | None, Option(callback=writable, metavar='FILE', help=(
-              'Draw the logs with both robots (.png or .svg).'))] = None,
+          rate: RateOption = None, robot: TheRobotOption = None, report: PageOption = None,
           json_path: JsonOption = None):
     """
     Write a robot file with intervals from logs of servos and rotors.

@@ -6,7 +6,6 @@ import shlex
 
 from rich.console import Console
 
-from beetle_omni_ros.identify import picture as of_logs
 from beetle_omni_ros.identify.measured import (
     read_logs,
     rotor_values,
@@ -19,7 +18,7 @@ from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
 from beetle_omni_ros.identify.servo import page as of_joints
 from beetle_omni_ros.identify.servo.joint import identify, joint_results
 from beetle_omni_ros.identify.servo.log import read_joint_log
-from beetle_omni_ros.pages.page import print_grids, Terminal
+from beetle_omni_ros.pages.page import page, print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.files import write_json, write_text
 
@@ -100,7 +99,7 @@ def run_identify_rotor(paths: Sequence[Path], *, columns: Sequence[str] = (),
 
 def run_identify_robot(paths: Sequence[Path], params: Path, *, rate: float | None = None,
                        robot: Path | None = None, json_path: Path | None = None,
-                       picture: Path | None = None, console: Console | None = None) -> dict:
+                       report: Path | None = None, console: Console | None = None) -> dict:
     """
     Write a robot file from logs of servos and rotors.
 
@@ -119,29 +118,32 @@ def run_identify_robot(paths: Sequence[Path], params: Path, *, rate: float | Non
     robot_parameters = RobotParameters.load(robot)
     joints, rotors, notes = read_logs(paths, rate)
     results: dict = {'servos': None, 'rotor': None, 'warnings': notes}
-    servo = rotor = model = None
+    servo = rotor = None
+    tables, sections = [], []
     if joints:
         with console.status('identifying the servos'):
-            found = identify(joints, robot_parameters, one_delay=True)
+            found = identify(joints, robot_parameters, as_file=True)
             servo = servo_values(found, robot_parameters)
         results['servos'] = joint_results(found, [], robot_parameters)
-        print_grids(of_joints.grids(results['servos']), console)
+        tables += of_joints.grids(results['servos'])
+        sections += of_joints.joint_sections(found, [], robot_parameters) if report else []
     if rotors:
         model = of_rotor.identify_rotor(rotors)
         results['rotor'] = of_rotor.rotor_results(model)
         rotor = rotor_values(results['rotor'])
-        print_grids(of_rotor.grids(results['rotor']), console)
+        tables += of_rotor.grids(results['rotor'])
+        sections += of_rotor.rotor_sections(model, robot_parameters) if report else []
     results['robot'] = write_measured(params, robot_parameters, robot, _line(
         'robot', paths, robot, params, rate), paths, servo, rotor)
-    both = {robot.stem if robot else 'published': robot_parameters,
-            'measured': RobotParameters.load(params)}
     if joints:
-        print_grids([of_logs.errors(joints, both)], console)
-    if picture:
-        lags = (results['rotor'] or {}).get('lag') or {'logs': []}
-        of_logs.draw(picture, joints, model, lags['logs'], both)
-    _print(console, [], [f'warning: {note}' for note in notes])
+        tables.append(of_joints.flown_errors(joints, {
+            robot.stem if robot else 'published': robot_parameters,
+            'measured': RobotParameters.load(params)}))
+    _print(console, tables, [f'warning: {note}' for note in notes])
     write_json(json_path, results)
+    if report:
+        write_text(report, page('Robot', f'identified for {params.name}', tables, notes, sections),
+                   'report')
     return results
 
 

@@ -37,7 +37,7 @@ def made(tmp_path_factory):
     rest[:, 2] *= np.linspace(0, 1, 60)
     logs.append(write_rows(folder / 'untimed.csv', rest, STAND))
     assert cli.main(['identify', 'robot', *map(str, logs), '--params', str(folder / 'mine.yaml'),
-                     '--json', str(folder / 'r.json'), '--picture', str(folder / 'p.svg')]) == 0
+                     '--json', str(folder / 'r.json'), '--report', str(folder / 'p.html')]) == 0
     return folder
 
 
@@ -73,7 +73,7 @@ def test_the_file_has_command_logs_and_what_no_log_shows_but_no_zero(made):
     assert {'mass', 'inertia', 'joints.inertia', 'battery', 'rotors.thrust_max'} <= set(left)
     assert not set(left) & {'joints.kp', 'rotors.map', 'rotors.time_constant'}
     assert 'untimed.csv' in (made / 'r.json').read_text()
-    assert (made / 'p.svg').read_text().startswith('<?xml')
+    assert (made / 'p.html').read_text().count('<img') == 5    # logs, surfaces, lag
 
 
 @pytest.mark.skipif(not (ROOT / '../shared/data/joint_response_100Hz.csv').is_file(),

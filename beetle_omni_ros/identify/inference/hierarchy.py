@@ -83,7 +83,7 @@ class Fit:
         evidence: logarithm [nat], without the constants of the noise.
         held: (folds,) logarithms of the density of each fold, predicted from the others [nat],
             without the constants of the noise.
-        deviations: (folds, X) change of x without each fold.
+        deviations: (blocks, X) change of x without each block.
         inflation: variance of the scores of blocks, or of stretches of time, over that of
             independent residuals, at least 1.
         converged: whether the minimum is nearer than 0.01 nat.
@@ -168,14 +168,15 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray,
     g = scores.sum(axis=(0, 1)) + x
     inside = log_integral(h, g, rows, room)
     prior = log_integral(np.eye(size), np.zeros(size), rows, limits)
-    out = [folds == fold for fold in range(folds.max() + 1)]
-    rests = [(h - matrices[part].sum(axis=0), g - scores[:, part].sum(axis=(0, 1)))
-             for part in out]
-    held = [-chi2[part].sum() / 2 + inside - log_integral(*rest, rows, room)
-            for part, rest in zip(out, rests, strict=True)]
+
+    def without(part) -> tuple[np.ndarray, np.ndarray]:
+        return h - matrices[part].sum(axis=0), g - scores[:, part].sum(axis=(0, 1))
+
+    held = [-chi2[part].sum() / 2 + inside - log_integral(*without(part), rows, room)
+            for part in (folds == fold for fold in range(folds.max() + 1))]
     return Fit(x, s, theta, float(chi2.sum()), h,
                float(-(chi2.sum() + x @ x) / 2 + inside - prior), np.array(held),
-               np.array([bounded_step(*rest, rows, room) for rest in rests]),
+               np.array([bounded_step(*without([b]), rows, room) for b in range(count)]),
                max(_inflation(h, each) for each in (
                    scores.reshape(len(s) * count, size), stretches)), converged)
 

@@ -1,4 +1,4 @@
-"""Normal equations, minimisation under linear bounds, and Gaussian integrals over half spaces."""
+"""Minimisation under linear bounds, and Gaussian integrals over half spaces."""
 
 from collections.abc import Callable
 
@@ -14,17 +14,6 @@ FAR = 6.0           # standard deviations from which a bound has no effect
 SWEEPS = 20         # of expectation propagation
 # cost, gradient (X,) and positive definite information (X, X) at coordinates (X,)
 Local = Callable[[np.ndarray], tuple[float, np.ndarray, np.ndarray]]
-
-
-def solved(h: np.ndarray, right: np.ndarray, ridge: float = 1e-9) -> np.ndarray:
-    """
-    Solution of normal equations ``h x = right`` with coordinates of different scale.
-
-    ``ridge`` is a relative increase of each diagonal element.
-    """
-    scale = 1 / np.sqrt(np.maximum(np.diag(h), 1e-12))
-    inner = h * scale[:, None] * scale + ridge * np.eye(len(h))
-    return (scale * np.linalg.solve(inner, (scale * right.T).T).T).T
 
 
 def bounded_step(h: np.ndarray, g: np.ndarray, rows: np.ndarray, room: np.ndarray) -> np.ndarray:

@@ -10,7 +10,6 @@ import numpy as np
 
 from beetle_omni_ros.identify.inference.hierarchy import design, solve, Spread, WIDTH
 from beetle_omni_ros.identify.inference.robust import consecutive
-from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor.log import RotorLog
 
 FIRST = 0.05            # [s] time constant to start from
@@ -22,6 +21,9 @@ BLOCKS = 20             # of a log, whose scatter gives the intervals
 LOOSE = 5.0             # ratio of interval's end and value, from which a log does not show a lag
 WIDE = (1.0, 1.0, 20.0, 1.0)    # prior standard deviations: time constants, dead time, gains
 STEP = 1e-4             # of differences
+GAIN_WINDOW = 0.5       # [s] with one gain between thrust and command
+GAIN_SCATTER = 0.2      # between windows, beyond which both do not belong together ...
+GAIN_SHARE = 0.7        # ... if the gains also lower the RMS error by this factor
 PHASES = 10             # of the windows
 STRONG = 0.2            # share of the largest command, above which the gain of a window is used
 
@@ -59,7 +61,7 @@ def fit_lag(log: RotorLog) -> dict | None:
     smooth, rms = _static(log, curve, rest)
     time, windows = log.columns['time'], []
     for phase in np.arange(PHASES) / PHASES:
-        index = np.floor((time - time[0]) / shipped().rotor.gain_window + phase).astype(int)
+        index = np.floor((time - time[0]) / GAIN_WINDOW + phase).astype(int)
         basis = curve[0] * (index == np.unique(index)[:, None])
         windows.append((*_static(log, basis, rest), basis, index))
     fine, least, basis, index = min(windows, key=lambda one: one[1])
@@ -67,14 +69,13 @@ def fit_lag(log: RotorLog) -> dict | None:
                       for k in np.unique(index)]).T
     means = means[:, means[0] > STRONG * command.max()]
     ratio = means[2] / np.maximum(means[1], STRONG * smooth.max())
-    p = shipped().rotor
-    if ratio.size < 4 or ratio.std() < p.gain_scatter * ratio.mean() \
-            or least > p.gain_share * rms:
+    if ratio.size < 4 or ratio.std() < GAIN_SCATTER * ratio.mean() \
+            or least > GAIN_SHARE * rms:
         return _fitted(log, curve, rest, '')
     gains = means[2] / means[0] if log.command == 'target' else ratio
     return _fitted(log, basis[basis.any(axis=1)], rest, (
         f'thrust and command do not belong together: their ratio jumps about every '
-        f'{p.gain_window:g} s ({gains.min():.2f} to {gains.max():.2f}); one curve leaves '
+        f'{GAIN_WINDOW:g} s ({gains.min():.2f} to {gains.max():.2f}); one curve leaves '
         f'{rms:.2f} N RMS, a gain for each window {least:.2f} N'))
 
 

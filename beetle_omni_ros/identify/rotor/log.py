@@ -7,7 +7,6 @@ import re
 
 import numpy as np
 
-from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.files import LogError, missing, read_table
 
@@ -21,6 +20,14 @@ COLUMNS: dict[str, dict[str, float]] = {
     'voltage': {'voltage_V': 1, 'voltage': 1, 'esc_voltage': 1}, 'rpm': {'rpm': 1},
     'temperature': {'temperature': 1}, 'pack': {'file_voltage': 1}}
 EXPECTED = 'pwm_us (or duty_percent, target_thrust),force_N (or fz),torque_N_m (or tz),voltage_V'
+LARGEST_FORCE = 200.0       # [N]
+LARGEST_TORQUE = 20.0       # [N m]
+DUTY = 40.0, 101.0          # [%] of 2000 us
+# Telemetry outside these ranges is masked [V, rpm, deg C].
+POSSIBLE = {'voltage': (5.0, 60.0), 'temperature': (-40.0, 200.0), 'rpm': (0.0, 60000.0)}
+LEAST_ROWS = 20
+SETTLING = 0.5      # [s] after a change of command, until thrust has settled
+STILL = 0.02        # share of the largest command by which its lagged value may differ then
 UNITS = {'thrust': 'newtons, thrust positive (grams?); see --column', 'torque': 'newton metres',
          'duty': 'duty of 2000 us, stop at 1000 us or 50 percent'}
 
@@ -83,13 +90,12 @@ def read_rotor_log(path: str | Path, columns: Mapping[str, tuple[str, float]] | 
     """
     source: dict[str, tuple[str, float]] = {}
     table, rows = read_table(path, lambda header: _wanted(header, columns or {}, source), EXPECTED)
-    p = shipped().rotor
-    if len(rows) < p.least_rows:
-        raise LogError(f'{path}: {len(rows)} rows are too few; expected at least {p.least_rows}')
+    if len(rows) < LEAST_ROWS:
+        raise LogError(f'{path}: {len(rows)} rows are too few; expected at least {LEAST_ROWS}')
     data = {name: table[column] * (factor or 1)
             for name, (column, factor) in source.items()}
-    for name, low, high in (('thrust', -p.largest_force / 10, p.largest_force),
-                            ('torque', -p.largest_torque, p.largest_torque), ('duty', *p.duty)):
+    for name, low, high in (('thrust', -LARGEST_FORCE / 10, LARGEST_FORCE),
+                            ('torque', -LARGEST_TORQUE, LARGEST_TORQUE), ('duty', *DUTY)):
         bad = np.flatnonzero((data.get(name, low) < low) | (data.get(name, low) > high))
         if bad.size:
             raise LogError(f'{path}: row {rows[bad[0]]}, column {source[name][0]}: found '
@@ -141,12 +147,10 @@ def _wanted(header, columns, source):
 
 def _telemetry(path, data, notes):
     """Replace impossible and held readings by interpolation between new ones."""
-    bounds = {'voltage': shipped().rotor.voltage, 'temperature': shipped().rotor.temperature,
-              'rpm': np.array([0, shipped().rotor.largest_speed])}
-    there = [name for name in bounds if name in data]
+    there = [name for name in POSSIBLE if name in data]
     if not there:
         return
-    bad = np.any([(data[name] < bounds[name][0]) | (data[name] > bounds[name][1])
+    bad = np.any([(data[name] < POSSIBLE[name][0]) | (data[name] > POSSIBLE[name][1])
                   for name in there], axis=0)
     ranges = ', '.join(f'{name} {data[name].min():g} to {data[name].max():g}' for name in there)
     if bad.mean() > 0.5:
@@ -173,7 +177,7 @@ def _transient(path, command, thrust, rate):
     longest = np.argmax(np.diff(edges))
     count, held = np.diff(edges)[longest], thrust[edges[longest]:edges[longest + 1]]
     first, last = np.median(held[:count // 3 + 1]), np.median(held[-(count // 3) - 1:])
-    if count < shipped().rotor.least_rows or abs(last - first) < 0.3 * np.ptp(thrust):
+    if count < LEAST_ROWS or abs(last - first) < 0.3 * np.ptp(thrust):
         return False
     if not rate:
         raise UntimedError(f'{path}: thrust goes from {first:.1f} to {last:.1f} N at one command, '
@@ -185,9 +189,9 @@ def _transient(path, command, thrust, rate):
 def _settled(time, command):
     lagged, level = np.empty(len(command)), 0.0     # the command before the log is unknown
     for k, step in enumerate(np.diff(time, prepend=time[0])):
-        level += (command[k] - level) * -np.expm1(-4 * step / shipped().rotor.settling)
+        level += (command[k] - level) * -np.expm1(-4 * step / SETTLING)
         lagged[k] = level
-    return np.abs(command - lagged) < shipped().rotor.still * np.abs(command).max()
+    return np.abs(command - lagged) < STILL * np.abs(command).max()
 
 
 def _checked(path, data, command, factor, series):

@@ -129,17 +129,21 @@ def grids(results: dict) -> list[Grid]:
 
 
 def rotor_page(model: RotorModel, robot: RobotParameters, results: dict) -> str:
-    """HTML page with surfaces, residuals and lags."""
+    """HTML page about an identification."""
+    notes = [f'verdict: {results["verdict"]}', *results['warnings']]
+    return page('Rotor', f'identified from {results["meta"]["log"]}', grids(results), notes,
+                rotor_sections(model, robot))
+
+
+def rotor_sections(model: RotorModel, robot: RobotParameters) -> list[str]:
+    """Sections with surfaces, residuals and lags."""
     with matplotlib.rc_context(STYLE):
-        sections = [section(
+        surfaces = [section(
             name.capitalize(), 'Dots: measured; line: surface at the mean voltage; dashed: the '
             'robot file. Below: measured minus surface.', svg(_over(model, name, robot), name))
             for name in model.surfaces]
-        sections += [section(f'Lag: {log.name}', 'Thrust over time.', svg(_lag(log, lag), 'lag'))
-                     for log, lag in model.lags]
-    notes = [f'verdict: {results["verdict"]}', *results['warnings']]
-    return page('Rotor', f'identified from {results["meta"]["log"]}', grids(results), notes,
-                sections)
+        return surfaces + [section(f'Lag: {log.name}', 'Thrust over time.',
+                                   svg(_lag(log, lag), 'lag')) for log, lag in model.lags]
 
 
 def _over(model, name, robot):

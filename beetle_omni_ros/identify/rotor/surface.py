@@ -12,13 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.identify.inference.robust import consecutive, interval, jackknife, linear
-from beetle_omni_ros.identify.parameters import shipped
-from beetle_omni_ros.identify.rotor.log import RotorLog
+from beetle_omni_ros.identify.rotor.log import LEAST_ROWS, RotorLog
 
 FORMS: tuple[tuple[tuple[int, int], ...], ...] = (
     ((1, 0), (2, 0)), ((1, 0), (2, 0), (3, 0)),
     ((1, 0), (2, 0), (3, 0), (2, 1), (3, 1)))   # powers of u and of the duty
 GROUPS = 5              # of rows with neighbouring voltages, if packs are not labelled
+LEAST_SWEEP = 0.1       # of the duty from stop 0 to full 1
+LEAST_HEATING = 5.0     # [K] that shows a drift with temperature
+BLOCKS = 40             # at most, whose scatter gives the intervals
+LEAST_PACKS = 5         # that serve as blocks; fewer do not show the scatter
 MAP_ROWS = 5            # of a robot file
 BELOW = 0.1             # share by which its lowest voltage is below the measured ones
 GRID = (1 - np.cos(np.linspace(0, np.pi, 101)[1:])) / 2     # dense at the ends, as errors are
@@ -62,19 +65,18 @@ def settled_rows(logs: Sequence[RotorLog]) -> Rows | None:
     logs = [log for log in logs if log.command == 'duty']
     shared = [name for name in ('duty', 'voltage', 'thrust', 'torque', 'temperature')
               if all(name in log.columns for log in logs)]
-    if not logs or sum(log.settled.sum() for log in logs) < shipped().rotor.least_rows:
+    if not logs or sum(log.settled.sum() for log in logs) < LEAST_ROWS:
         return None
     rows = {name: np.concatenate([log.columns[name][log.settled] for log in logs])
             for name in shared}
-    p = shipped().rotor
-    if np.ptp(rows['duty']) < p.least_sweep or np.unique(rows['duty'].round(2)).size < 5:
+    if np.ptp(rows['duty']) < LEAST_SWEEP or np.unique(rows['duty'].round(2)).size < 5:
         return None
     # Without labels, each log has its own pack.
     pack = np.concatenate([log.columns.get('pack', np.full(len(log.settled), -k))[log.settled]
                            for k, log in enumerate(logs)])
     names, label = np.unique(pack, return_inverse=True)
     changes = np.append(True, (np.diff(rows['duty']) != 0) | (np.diff(label) != 0))
-    block = label if len(names) >= p.least_packs else consecutive(changes, p.blocks)
+    block = label if len(names) >= LEAST_PACKS else consecutive(changes, BLOCKS)
     group = label if len(names) > 2 else np.digitize(rows['voltage'], np.quantile(
         rows['voltage'], np.arange(1, GROUPS) / GROUPS))
     return rows | {'step': np.cumsum(changes) - 1, 'block': block,
@@ -125,22 +127,21 @@ def torque_ratio(rows: Rows) -> dict:
         return np.array([linear(thrust[mask, None], torque[mask] - tare)[0], tare])
 
     every = jackknife(fit, block)
-    (value, tare), offset = every[0], np.column_stack([thrust, np.ones(len(thrust))])
+    offset = np.column_stack([thrust, np.ones(len(thrust))])
     return {**estimate(every[:, 0], 'm'),
-            'rms_N_m': float(np.sqrt(np.mean((torque - tare - value * thrust)**2))),
-            'at_rest_N_m': float(tare) if rest.any() else None,
+            'at_rest_N_m': float(every[0, 1]) if rest.any() else None,
             'with_free_offset': float(linear(offset, torque)[0])}
 
 
 def temperature_drift(rows: Rows, thrust: Surface) -> dict | None:
     """Relative change of thrust with temperature at equal duty and voltage; None: not shown."""
-    if 'temperature' not in rows or np.ptp(rows['temperature']) < shipped().rotor.least_heating:
+    if 'temperature' not in rows or np.ptp(rows['temperature']) < LEAST_HEATING:
         return None
     heat = rows['temperature'] - rows['temperature'].mean()
     x = np.column_stack([terms(thrust.form, rows['duty'], rows['voltage']),
                          thrust.at(rows['duty'], rows['voltage'])[:, 0] * heat])
     every = jackknife(lambda m: linear(x[m], rows['thrust'][m])[-1], rows['block'])
-    return {**estimate(every, '1/K'), 'range_K': float(np.ptp(heat))}
+    return estimate(every, '1/K')
 
 
 def map_rows(rows: Rows, thrust: Surface) -> list[dict]:
@@ -162,10 +163,9 @@ def map_rows(rows: Rows, thrust: Surface) -> list[dict]:
             np.gradient(level, duty), 1e-3)) for level in levels.T])    # least error of thrust
         error = np.gradient(levels[:, 0], 50 * duty) * (
             np.polyval(cubics[0], levels[:, 0] / 10) - 50 - 50 * duty)
-        slope = np.polyval(np.polyder(cubics[0]), np.linspace(0, levels[-1, 0] / 10, 100))
         found.append({
             'voltage_V': float(voltage), 'thrust_max_N': float(min(levels[-1, 0], most)),
             'coefficients': {f'c{k}': estimate(cubics[:, 3 - k], '%') for k in range(4)},
-            'rms_N': float(np.sqrt(np.mean(error**2))), 'monotone': bool(slope.min() > 0),
+            'rms_N': float(np.sqrt(np.mean(error**2))),
             'thrust_half_width_N': float(max(np.ptp(interval(one)) for one in levels) / 2)})
     return found

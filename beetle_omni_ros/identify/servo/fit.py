@@ -17,7 +17,6 @@ from scipy.stats import chi2
 from beetle_omni_ros.identify.inference.hierarchy import design, Fit, solve
 from beetle_omni_ros.identify.inference.noise import Drifting, drifting
 from beetle_omni_ros.identify.inference.robust import HUBER, scale_of
-from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.identify.servo.model import (
     INDEX,
@@ -32,6 +31,10 @@ from beetle_omni_ros.robot.effects import CATALOGUE
 LOGARITHMIC = np.array([term.logarithmic for term in TERMS.values()])
 # Of the derivatives: over the kinks of friction and of held commands.
 STEP = np.where(LOGARITHMIC, 0.03, 6e-4)
+SETTLING = 0.25     # [s] at the start that are not fitted: the first velocity is not measured
+FIRST_NOISE = 0.002     # [rad] white noise of the first fit
+BEYOND = 1.15       # ratio of the speed of a command and of the joint from which limits are fitted
+KINDS = 8           # of motion in a log, each left out in turn
 LATE = 0.03         # [s] of a reading behind its command, about
 MOMENTS = np.linspace(-0.4, 0.0, 9)     # [s] of commands that determine the kind of motion
 # Starts of terms whose chi2 has several minima, or no slope at zero.
@@ -101,7 +104,6 @@ class Servos:
     """
 
     def __init__(self, logs: Sequence[JointLog], base: np.ndarray, one_delay: bool = False):
-        p = shipped().servo
         self.logs = list(logs)
         self.units = [(k, j, number) for k, log in enumerate(logs)
                       for j, number in enumerate(log.joints)]
@@ -113,17 +115,17 @@ class Servos:
         self.labels: dict[str, Sequence] = {'joint': [number for *_, number in self.units],
                        'log': [k for k, *_ in self.units], 'unit': self.units}
         self._parts = [log.first() for log in self.logs]
-        self.rows = [np.flatnonzero((log.fresh & (log.t >= log.t[0] + p.settling))[:log.end])
+        self.rows = [np.flatnonzero((log.fresh & (log.t >= log.t[0] + SETTLING))[:log.end])
                      for log in self.logs]
         self.low = LOW.copy()
-        self.sigma = np.full(len(self.units), p.first_noise)
+        self.sigma = np.full(len(self.units), FIRST_NOISE)
         self.noise = [Drifting(len(rows)) for rows in self.rows]
         kinds = kinds_of_motion([(self.logs[k], j, self.rows[k]) for k, j, _ in self.units],
-                                p.blocks)
-        self.blocks = [kind + p.blocks * k for kind, (k, *_) in zip(kinds, self.units,
+                                KINDS)
+        self.blocks = [kind + KINDS * k for kind, (k, *_) in zip(kinds, self.units,
                                                                     strict=True)]
         # Each log is predicted from the others, or each kind of motion of one or two logs.
-        self.folds = np.arange(p.blocks * len(logs)) // (p.blocks if len(logs) > 2 else 1)
+        self.folds = np.arange(KINDS * len(logs)) // (KINDS if len(logs) > 2 else 1)
 
     # ---- model of the core
     def __call__(self, theta: np.ndarray, active: np.ndarray):
@@ -261,8 +263,7 @@ class Servos:
 
     def candidates(self) -> list[str]:
         """Entries that these logs can show: a limit only if the commands exceed it."""
-        least = shipped().servo.beyond
-        beyond = any((log.command_speed() > least * log.speed()).any() for log in self._parts)
+        beyond = any((log.command_speed() > BEYOND * log.speed()).any() for log in self._parts)
         return [name for name in ENTRIES if beyond or name not in LIMITS]
 
 
@@ -289,10 +290,6 @@ class Found:
     def values(self, trial: Trial | None = None) -> np.ndarray:
         """(U, P) parameter sets of the units."""
         return decoded((trial or self.chosen).fit.theta)
-
-    def of_log(self, index: int, trial: Trial | None = None) -> np.ndarray:
-        """(J, P) parameter sets of the joints of one log."""
-        return self.values(trial)[np.array(self.servos.labels['log']) == index]
 
 
 def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least: float = 0.0,
@@ -325,12 +322,9 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
     def gain(trial):
         return trial.fit.evidence
 
-    while True:
-        trials = {name: servos.fit([*chosen.entries, name], starts=(chosen, full))
-                  for name in candidates if name not in chosen.entries}
-        better = [trial for trial in trials.values() if worth(trial, chosen)]
-        if not better:
-            break
+    while better := [trial for trial in (
+            servos.fit([*chosen.entries, name], starts=(chosen, full))
+            for name in candidates if name not in chosen.entries) if worth(trial, chosen)]:
         chosen = max(better, key=gain)
     while True:
         without = {name: servos.fit([other for other in chosen.entries if other != name],

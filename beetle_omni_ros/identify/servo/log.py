@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.runs.files import LogError, missing, read_table
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
-JOINTS = (1, 2, 3, 4)
+JOINTS: tuple[int, ...] = (1, 2, 3, 4)
 NEIGHBOURS = 5      # readings on each side that determine the time of one
+FITTED = 0.6        # share of a log; the rest is for validation
+PERIODS = 2e-4, 0.1     # [s] between samples; slower sampling cannot resolve a servo
+LONGEST_GAP = 0.25      # [s]
+LEAST_DURATION = 2.0    # [s]
+LEAST_SAMPLES = 100
+LEAST_TRAVEL = 0.02     # [rad] of the command and of each joint
+LARGEST_ANGLE = 13.0    # [rad] two turns; a larger value is not in radians
+HISTORY = 0.3           # [s] before the log, in which the command is extrapolated
+LONGEST_BAG = 30.0      # [s] used of a bag; more takes minutes and adds little information
+LAST_COMMAND = 0.1      # [s] for which the actuators execute the last command
 
 
 @dataclass(frozen=True)
@@ -27,8 +37,6 @@ class JointLog:
         joints: (n,) numbers of the joints, 1 to 4.
         measured: (n, N) encoder positions [rad].
         command: (n, N) commanded positions [rad].
-        fresh: (N,) rows with a new reading; the others repeat the last one.
-        read_t: (N,) times of the readings of fresh rows [s]; the others are nan.
 
     """
 
@@ -37,52 +45,61 @@ class JointLog:
     joints: tuple[int, ...]
     measured: np.ndarray
     command: np.ndarray
-    period: float = field(init=False)
-    fresh: np.ndarray = field(init=False)
-    read_t: np.ndarray = field(init=False)
-    start: np.ndarray = field(init=False)
-    start_velocity: np.ndarray = field(init=False)
-    _command_t: np.ndarray = field(init=False, repr=False)
-    _command: np.ndarray = field(init=False, repr=False)
-    _total: np.ndarray = field(init=False, repr=False)
 
-    def __post_init__(self):
-        """Derive sampling period [s], first positions [rad] and velocities [rad/s]."""
-        period = float(np.median(np.diff(self.t)))
-        count = max(4, int(round(0.04 / period)) + 1)
-        fresh = fresh_rows(self.measured)
-        used = np.flatnonzero(fresh)[:max(4, int(fresh[:count].sum()))]
-        read_t = np.full(len(self.t), np.nan)
-        read_t[fresh] = reading_times(self.t[fresh], period)
-        first = np.polyfit(read_t[used] - self.t[0], self.measured[:, used].T, 2)
-        slope = np.polyfit(self.t[:count] - self.t[0], self.command[:, :count].T, 1)[0]
-        back = -period * np.arange(int(shipped().log.history / period) + 1, 0, -1)
-        before = self.command[:, :1] + slope[:, None] * back
-        command_t = np.concatenate([self.t[0] + back, self.t])
-        command = np.concatenate([before, self.command], axis=1)
-        total = np.cumsum(command[:, :-1] * np.diff(command_t), axis=1)
-        total = np.concatenate([np.zeros((len(command), 1)), total], axis=1)
-        known = {'_total': total, 'period': period, 'fresh': fresh,
-                 'read_t': read_t, 'start': first[2], 'start_velocity': first[1],
-                 '_command_t': command_t, '_command': command}
-        for name, value in known.items():
-            object.__setattr__(self, name, value)
+    @cached_property
+    def period(self) -> float:
+        """Time between rows [s]."""
+        return float(np.median(np.diff(self.t)))
+
+    @cached_property
+    def fresh(self) -> np.ndarray:
+        """(N,) rows with a new reading; the others repeat the last one."""
+        return fresh_rows(self.measured)
+
+    @cached_property
+    def read_t(self) -> np.ndarray:
+        """(N,) times of the readings of fresh rows [s]; the others are nan."""
+        times = np.full(len(self.t), np.nan)
+        times[self.fresh] = reading_times(self.t[self.fresh], self.period)
+        return times
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """(2, n) first positions [rad] and velocities [rad/s]."""
+        used = np.flatnonzero(self.fresh)[:max(4, int(self.fresh[:self._first].sum()))]
+        return np.polyfit(self.read_t[used] - self.t[0], self.measured[:, used].T, 2)[:0:-1]
+
+    @property
+    def _first(self) -> int:
+        """Number of rows of the first 40 ms."""
+        return max(4, int(round(0.04 / self.period)) + 1)
+
+    @cached_property
+    def _commands(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times (M,), commands (n, M) with a straight line before the log, their integrals."""
+        slope = np.polyfit(self.t[:self._first] - self.t[0], self.command[:, :self._first].T, 1)[0]
+        back = -self.period * np.arange(int(HISTORY / self.period) + 1, 0, -1)
+        t = np.concatenate([self.t[0] + back, self.t])
+        command = np.concatenate([self.command[:, :1] + slope[:, None] * back, self.command], 1)
+        total = np.cumsum(command[:, :-1] * np.diff(t), axis=1)
+        return t, command, np.concatenate([np.zeros((len(command), 1)), total], axis=1)
 
     def command_at(self, joint: int, times: np.ndarray) -> np.ndarray:
         """Command of a joint (index) by linear interpolation [rad]; linear before the log."""
-        return np.interp(times, self._command_t, self._command[joint])
+        t, command, _ = self._commands
+        return np.interp(times, t, command[joint])
 
     def held_command(self, joint: int, edges: np.ndarray) -> np.ndarray:
         """Means (K,) over the steps between ``edges`` (K + 1,) of the command held until a row."""
-        row = np.maximum(np.searchsorted(self._command_t, edges, side='right') - 1, 0)
-        total = self._total[joint, row] + self._command[joint, row] * (
-            edges - self._command_t[row])
-        return np.diff(total) / np.diff(edges)
+        t, command, total = self._commands
+        row = np.maximum(np.searchsorted(t, edges, side='right') - 1, 0)
+        integral = total[joint, row] + command[joint, row] * (edges - t[row])
+        return np.diff(integral) / np.diff(edges)
 
     @property
     def end(self) -> int:
         """Number of samples of the fitted part; the others are held out."""
-        return int(round(shipped().servo.fitted * len(self.t)))
+        return int(round(FITTED * len(self.t)))
 
     def first(self) -> JointLog:
         """The fitted part of the log."""
@@ -185,77 +202,64 @@ def read_joint_log(path: str | Path) -> JointLog:
 
     """
     if is_bag(Path(path)):
+        joints = JOINTS
         t, measured, command = read_bag_response(Path(path))
-        _check_times(path, t, np.arange(1, len(t) + 1))
-        for k, position, wanted in zip(JOINTS, measured, command, strict=True):
-            _check_angles(path, k, position, wanted)
-        return JointLog(Path(path).name, t, JOINTS, measured, command)
-    columns, rows = read_table(path, _wanted, HEADER)
-    t = columns['t_s']
+        rows = np.arange(1, len(t) + 1)
+    else:
+        columns, rows = read_table(path, _wanted, HEADER)
+        t = columns['t_s']
+        joints = tuple(k for k in JOINTS if f'q{k}_rad' in columns)
+        measured = np.stack([columns[f'q{k}_rad'] for k in joints])
+        command = np.stack([columns[own if (own := f'command{k}_rad') in columns
+                                    else 'command_rad'] for k in joints])
     _check_times(path, t, rows)
-    joints = tuple(k for k in JOINTS if f'q{k}_rad' in columns)
-    measured = np.stack([columns[f'q{k}_rad'] for k in joints])
-    command = np.stack([columns[own if (own := f'command{k}_rad') in columns
-                                      else 'command_rad'] for k in joints])
     for k, position, wanted in zip(joints, measured, command, strict=True):
         _check_angles(path, k, position, wanted)
     return JointLog(Path(path).name, t, joints, measured, command)
 
 
 def _wanted(header):
-    if 't_s' not in header:
-        raise missing('t_s', header)
-    joints = [k for k in JOINTS if f'q{k}_rad' in header]
-    if not joints:
-        raise missing('q1_rad', header)
-    odd = [cell for cell in header if cell[:1] == 'q' and cell[1:2].isdigit()
-           and cell not in [f'q{k}_rad' for k in JOINTS]]
-    if odd:
-        raise LogError(f"column '{odd[0]}' is not one of q1_rad to q4_rad")
-    names = ['t_s', *(f'q{k}_rad' for k in joints)]
-    if 'command_rad' in header:
-        return [*names, 'command_rad']
-    if not any(f'command{k}_rad' in header for k in joints):
-        raise missing('command_rad', header)
-    for k in joints:
-        if f'command{k}_rad' not in header:
-            raise missing(f'command{k}_rad', header)
-    return names + [f'command{k}_rad' for k in joints]
+    joints = [k for k in JOINTS if f'q{k}_rad' in header] or JOINTS[:1]
+    own = any(f'command{k}_rad' in header for k in joints) and 'command_rad' not in header
+    names = ['t_s', *(f'q{k}_rad' for k in joints),
+             *([f'command{k}_rad' for k in joints] if own else ['command_rad'])]
+    for name in names:
+        if name not in header:
+            raise missing(name, header)
+    return names
 
 
 def _check_times(path, t, rows):
-    p = shipped().log
-    if len(t) < p.least_samples:
+    if len(t) < LEAST_SAMPLES:
         raise LogError(f'{path}: {len(t)} rows are too few; expected at least '
-                       f'{p.least_samples}')
+                       f'{LEAST_SAMPLES}')
     steps = np.diff(t)
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0)) + 1
         raise LogError(f'{path}: row {rows[k]}, column t_s: {t[k]:g} s does not come after '
                        f'{t[k - 1]:g} s; expected increasing times')
     period = float(np.median(steps))
-    if not p.periods[0] <= period <= p.periods[1]:
+    if not PERIODS[0] <= period <= PERIODS[1]:
         raise LogError(f'{path}: column t_s: samples are {period:g} s apart; expected '
-                       f'{p.periods[0]:g} to {p.periods[1]:g} s (is the time in '
+                       f'{PERIODS[0]:g} to {PERIODS[1]:g} s (is the time in '
                        'seconds?)')
-    if t[-1] - t[0] < p.least_duration:
+    if t[-1] - t[0] < LEAST_DURATION:
         raise LogError(f'{path}: {t[-1] - t[0]:.2f} s are too short; expected at least '
-                       f'{p.least_duration:g} s')
-    if steps.max() > p.longest_gap:
+                       f'{LEAST_DURATION:g} s')
+    if steps.max() > LONGEST_GAP:
         k = int(np.argmax(steps)) + 1
         raise LogError(f'{path}: row {rows[k]}: {steps.max():.2f} s without a sample; '
-                       f'expected gaps below {p.longest_gap:g} s (split the log there)')
+                       f'expected gaps below {LONGEST_GAP:g} s (split the log there)')
 
 
 def _check_angles(path, joint, position, command):
-    p = shipped().log
     for name, values in (('the command', command), (f'q{joint}_rad', position)):
-        if np.abs(values).max() > p.largest_angle:
+        if np.abs(values).max() > LARGEST_ANGLE:
             raise LogError(f'{path}: {name} reaches {np.abs(values).max():g}; expected radians '
-                           f'within +-{p.largest_angle:g} (degrees or encoder counts?)')
-        if np.ptp(values) < p.least_travel:
+                           f'within +-{LARGEST_ANGLE:g} (degrees or encoder counts?)')
+        if np.ptp(values) < LEAST_TRAVEL:
             raise LogError(f'{path}: {name} moves by {np.ptp(values):.4f} rad only; expected at '
-                           f'least {p.least_travel:g} rad (a constant does not identify a '
+                           f'least {LEAST_TRAVEL:g} rad (a constant does not identify a '
                            'servo)')
     ratio = np.ptp(position) / np.ptp(command)
     if not 0.1 < ratio < 10:
@@ -277,7 +281,7 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Returns:
         (N,) times from the first [s], (4, N) positions [rad], (4, N) commands [rad], of the
-        longest interval with commands; of a long one, the part of ``longest_bag`` with most
+        longest interval with commands; of a long one, the part of ``LONGEST_BAG`` with most
         motion.
 
     Raises:
@@ -296,7 +300,7 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     fresh = np.r_[True, np.diff(log.joint_t) > 0]
     t, position = log.joint_t[fresh], log.joint_position[fresh]
     last = np.searchsorted(received, t, side='right') - 1
-    driven = (last >= 0) & (t - received[np.maximum(last, 0)] <= shipped().log.last_command)
+    driven = (last >= 0) & (t - received[np.maximum(last, 0)] <= LAST_COMMAND)
     edges = np.flatnonzero(np.diff(np.r_[False, driven, False].astype(int)))
     stretches = edges.reshape(-1, 2)
     if not len(stretches):
@@ -309,9 +313,8 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _most_motion(t, command, first, end):
-    """The part of an interval, at most ``longest_bag`` long, in which the commands travel most."""
-    longest = shipped().log.longest_bag
-    ends = np.minimum(np.searchsorted(t, t[first:end] + longest, side='right'), end)
+    """The part of an interval, at most ``LONGEST_BAG`` long, in which the commands travel most."""
+    ends = np.minimum(np.searchsorted(t, t[first:end] + LONGEST_BAG, side='right'), end)
     travel = np.cumsum(np.r_[0.0, np.abs(np.diff(command[:end], axis=0)).sum(axis=1)])
     gain = travel[ends - 1] - travel[first:end]
     begin = first + int(np.argmax(gain))

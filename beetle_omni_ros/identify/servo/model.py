@@ -21,7 +21,6 @@ import numpy as np
 from beetle_omni_ros.identify.inference.hierarchy import Spread
 from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.robot.native import built, EXACT, generated
-from beetle_omni_ros.robot.parameters import JointParameters
 from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.robot.servo import CASADI, play, Servo, Step
 
@@ -91,7 +90,8 @@ TERMS = {
                         words='load (cosine)'),
     # Errors of the reading: gain q + sine sin q + cosine (cos q - 1). The harmonics are those of
     # an encoder whose axis is off the joint's.
-    'encoder_gain': Term('1', 0.0, -0.3, 0.3, 0.002, Spread(0.0, {'joint': 0.02}), in_step=False),
+    'encoder_gain': Term('1', 0.0, -0.3, 0.3, 0.002, Spread(0.0, {'joint': 0.02}),
+                         words='gain of the reading', in_step=False),
     'encoder_sine': Term('rad', 0.0, -0.3, 0.3, 0.002, Spread(0.0, {'joint': 0.02}),
                          in_step=False),
     'encoder_cosine': Term('rad', 0.0, -0.3, 0.3, 0.002, Spread(0.0, {'joint': 0.02}),
@@ -124,16 +124,6 @@ void servo_run(long steps, long sets, double step, const double *command, const 
 """
 
 
-def published_set(joint: JointParameters) -> np.ndarray:
-    """Parameter set of a robot file's joint: second order with limits."""
-    values = OFF.copy()
-    values[INDEX['natural_frequency']] = joint.natural_frequency
-    values[INDEX['damping_ratio']] = joint.damping_ratio
-    values[INDEX['velocity_limit']] = joint.velocity_limit
-    values[INDEX['torque_limit']] = joint.effort_limit / joint.kp
-    return values
-
-
 def simulate(log: JointLog, joint: np.ndarray | int, sets: np.ndarray,
              held: bool = True) -> np.ndarray:
     """
@@ -159,8 +149,7 @@ def simulate(log: JointLog, joint: np.ndarray | int, sets: np.ndarray,
     count = int(np.ceil((times.max() - log.t[0]) / step - 1e-6))
     value = dict(zip(NAMES, sets.T, strict=True))
     command = _commands(log, joint, value['delay'], log.t[0] + step * np.arange(count + 1), held)
-    positions = _integrate(value, command + value['offset'], log.start[joint],
-                           log.start_velocity[joint], step)
+    positions = _integrate(value, command + value['offset'], log.start[:, joint], step)
     return with_encoder_errors(_at_samples(positions, (times - log.t[0]) / step), value)
 
 
@@ -182,19 +171,20 @@ def _commands(log, joint, delay, edges, held):
     return np.stack(means, axis=1)[:, which.ravel()]
 
 
-def _integrate(value, command, q, v, step):
-    """Positions (K + 1, B) of held commands (K, B)."""
+def _integrate(value, command, start, step):
+    """Positions (K + 1, B) of held commands (K, B) from positions and velocities (2, B)."""
     # Leapfrog: positions are half a step ahead of velocities.
-    middle, velocity = np.empty((2, len(command) + 1, len(q)))
+    (q, v), count = start, command.shape[1]
+    middle, velocity = np.empty((2, len(command) + 1, count))
     middle[0], velocity[0] = q + 0.5 * step * v, v
     numbers = np.ascontiguousarray([value[name] for name in STEP_TERMS])
     if (run := _compiled()) is not None:
         run(*command.shape, step, np.ascontiguousarray(command), numbers, middle, velocity)
     else:
-        advance = _advance().map(len(q))
+        advance = _advance().map(count)
         for k, target in enumerate(command):
             middle[k + 1], velocity[k + 1] = (moved.full().ravel() for moved in advance(
-                *(row[None] for row in (target, middle[k], velocity[k], np.full(len(q), step),
+                *(row[None] for row in (target, middle[k], velocity[k], np.full(count, step),
                                         *numbers))))
     positions = middle - 0.5 * step * velocity
     return play(positions, value['backlash']) if value['backlash'].any() else positions

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import matplotlib
 from matplotlib.figure import Figure
+import numpy as np
 
 from beetle_omni_ros.identify.flights.page import head
-from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.fit import Found
-from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
+from beetle_omni_ros.identify.servo.log import FITTED, JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.identify.servo.robot import file_sets, held
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
@@ -62,13 +62,26 @@ def _value(term):
     return f'{value},\n{low}..{high}'      # two lines: four joints fit into 80 columns
 
 
+def flown_errors(logs: Sequence[JointLog], robots: dict[str, RobotParameters]) -> Grid:
+    """Errors of robots as the simulator flies them, behind its delays and with the logs' zeros."""
+    rows = []
+    for log in logs:
+        for name, robot in robots.items():
+            sets = file_sets(robot, flown=True)[np.array(log.joints) - 1]
+            error = simulate(log, np.arange(len(sets)), sets) - log.measured
+            rows.append([f'{log.name}, {name}', *(f'{MILLI * np.std(one[log.fresh]):.1f}'
+                                                  for one in error)])
+    return Grid('RMS error of the servos as simulated, without zeros [mrad]',
+                ['', *(f'joint {number}' for number in logs[0].joints)], rows)
+
+
 def joint_page(found: Found, validations: Sequence[JointLog], robot: RobotParameters,
                results: dict) -> str:
     """HTML page about an identification."""
     logs = found.servos.logs
     names = ', '.join(each.name for each in logs)
     return page('Tilt servos', f'identified from {names}', grids(results), results['text'],
-                _sections(found, validations, robot))
+                joint_sections(found, validations, robot))
 
 
 def gap_log_page(apart: Found, result: dict, tables: Sequence[Grid], robot: RobotParameters
@@ -78,13 +91,13 @@ def gap_log_page(apart: Found, result: dict, tables: Sequence[Grid], robot: Robo
                                                 *result['meta']['holdout']]]
     return page('Tilt servos', f'{apart.servos.logs[0].name} against the robot file',
                 [*tables, *grids(result | {'meta': {'validate': [o.name for o in others]}})],
-                result['text'], _sections(apart, others, robot), head(result, ''))
+                result['text'], joint_sections(apart, others, robot), head(result, ''))
 
 
-def _sections(found, others, robot):
+def joint_sections(found: Found, others: Sequence[JointLog], robot: RobotParameters) -> list[str]:
     """A section with responses and errors of each log."""
     logs = found.servos.logs
-    models = dict(zip(logs[0].joints, found.of_log(0), strict=True))
+    models = dict(zip(logs[0].joints, found.values(), strict=False))     # of the first log
     with matplotlib.rc_context(STYLE):
         return [section(
             other.name + (': fitted to the shaded part' if k < len(logs) else ': not fitted'),
@@ -110,7 +123,7 @@ def _figure(log, models, robot, fitted) -> Figure:
         right.set_ylabel('error [mrad]')
         if fitted:
             for axis in (left, right):
-                axis.axvspan(0, shipped().servo.fitted * t[-1], color='#eef3f8', lw=0)
+                axis.axvspan(0, FITTED * t[-1], color='#eef3f8', lw=0)
     for axis in axes[-1]:
         axis.set_xlabel('time [s]')
     legend(figure, axes[0, 1])

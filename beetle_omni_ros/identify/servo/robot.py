@@ -10,8 +10,9 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import load_yaml
 
-# Catalogue entry -> the terms that it changes.
+# Entry -> the terms that it changes; of the catalogue, but for the gain and the load.
 ENTRIES = {
+    'reading_gain': ('encoder_gain',),
     'joint_bandwidth': ('natural_frequency', 'damping_ratio'),
     'joint_command_latency': ('delay',),
     'joint_friction': ('coulomb_friction', 'stiction'),
