@@ -6,7 +6,8 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.topics import ALL
-from beetle_omni_ros.messages.values import MessageError, Odom
+from beetle_omni_ros.messages.values import MessageError
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading, JointReading, PoseReading
 from beetle_omni_ros.runs.targets import TargetChecks
@@ -56,7 +57,7 @@ def why_wrong(target, checks):
 def test_hostile_messages_are_accepted_or_refused():
     rng, checks, zero = np.random.default_rng(1), TargetChecks(RobotParameters.load()), np.zeros(3)
     values = {'mocap/pose': PoseReading(1.0, zero, LEVEL),
-              'odom': Odom(1.0, zero, zero, LEVEL, zero),
+              'odom': BodyState(1.0, zero, zero, LEVEL, zero),
               'command': Command(1.0, np.zeros(4), np.ones(4)),
               'joint_states': JointReading(1.0, np.zeros(4), np.zeros(4)),
               'battery_state': BatteryReading(1.0, 24.0, -9.0),

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, NO_ZEROS, ROTORS
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.mode import FLYING, Mode
 
 AT_REST = np.zeros(3)           # velocity of a pose
@@ -40,17 +41,12 @@ class Command:
     thrust: np.ndarray
 
 
-@dataclass(frozen=True)
-class State:
+@dataclass(slots=True, eq=False)
+class State(BodyState):
     """
-    The estimated state, input of a controller.
+    The estimated state, input of a controller: a BodyState with the tilt joints.
 
     Attributes:
-        stamp: time of the estimate [s].
-        position: (3,) base_link in world [m].
-        velocity: (3,) of base_link, expressed in world [m/s].
-        quaternion: (4,) body to world, (x, y, z, w), unit.
-        angular_velocity: (3,) in base_link [rad/s].
         tilt: (4,) latest measured tilt angles [rad].
         tilt_velocity: (4,) their rates [rad/s].
         tilt_stamp: capture time of ``tilt`` [s].
@@ -58,18 +54,13 @@ class State:
 
     """
 
-    stamp: float
-    position: np.ndarray
-    velocity: np.ndarray
-    quaternion: np.ndarray
-    angular_velocity: np.ndarray
     tilt: np.ndarray
     tilt_velocity: np.ndarray
     tilt_stamp: float
     command: Command | None = None
 
     @classmethod
-    def join(cls, estimate: Any, joints: Any, command: Command | None = None) -> State:
+    def join(cls, estimate: BodyState, joints: Any, command: Command | None = None) -> State:
         """Join the estimate, the measured joints and the command in force."""
         return cls(estimate.stamp, estimate.position, estimate.velocity, estimate.quaternion,
                    estimate.angular_velocity, joints.position, joints.velocity, joints.stamp,
@@ -306,8 +297,8 @@ class ControllerHost:
         self._health = health
         self.call('set_health', health)
 
-    def on_estimate(self, estimate: Any) -> None:
-        """Take position (3,), quaternion (4,) and stamp of each estimate."""
+    def on_estimate(self, estimate: BodyState) -> None:
+        """Take the pose of each estimate."""
         self._position = estimate.position
         if self.target is None and (self._hold is None or self.mode.state != FLYING):
             self._hold = PoseTarget(estimate.position, estimate.quaternion, estimate.stamp)

@@ -265,7 +265,8 @@ class ErrorStateModel:
                 self.covariance(node)[:ERROR_STATES, :ERROR_STATES], arm)
 
         return Estimate(node.stamp, position, velocity, quaternion, rate,
-                        node.accelerometer_bias, node.gyroscope_bias, covariance)
+                        node.accelerometer_bias, node.gyroscope_bias, covariance,
+                        self.parameters.imu.gyroscope_noise)
 
     def _extrapolated(self, node, age, readings) -> tuple[np.ndarray, ...]:
         """

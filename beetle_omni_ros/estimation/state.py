@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.body import BodyState
 
 # The 15 error states: position and velocity in world, attitude as rotation vector in base_link
 # (R_true = R exp(theta)), accelerometer and gyroscope bias. The offset between the sensors' clocks
@@ -114,48 +115,38 @@ def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
     return out
 
 
-@dataclass
-class Estimate:
-    """State of base_link at the newest IMU sample."""
+@dataclass(eq=False)
+class Estimate(BodyState):
+    """State of base_link at the newest IMU sample, with biases removed."""
 
-    stamp: float                    # of that sample [s]
-    position: np.ndarray            # (3,) in world [m]
-    velocity: np.ndarray            # (3,) in world [m/s]
-    quaternion: np.ndarray          # (4,) body to world (x, y, z, w), unit
-    angular_velocity: np.ndarray    # (3,) in base_link, bias removed [rad/s]
     accelerometer_bias: np.ndarray  # (3,) in base_link axes [m/s^2]
     gyroscope_bias: np.ndarray      # (3,) in base_link axes [rad/s]
     compute_covariance: Callable[[], np.ndarray] = field(repr=False)
+    gyroscope_noise: float          # standard deviation of a sample, each axis [rad/s]
 
     @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance (15, 15) of the error, in the order of this module's slices."""
         return self.compute_covariance()
 
+    def pose_covariance(self) -> np.ndarray:
+        """
+        Covariance (6, 6) of position [m] and rotation about world axes [rad].
 
-def pose_covariance(estimate: Estimate) -> np.ndarray:
-    """
-    Covariance (6, 6) of position [m] and rotation about world axes [rad].
+        The filter's rotation error is about body axes, that of nav_msgs/Odometry about world axes.
+        """
+        jacobian = np.zeros((6, ERROR_STATES))
+        jacobian[:3, POSITION] = np.eye(3)
+        jacobian[3:, ATTITUDE] = rotations.matrix(self.quaternion)
+        return jacobian @ self.covariance @ jacobian.T
 
-    The filter's rotation error is about body axes, that of nav_msgs/Odometry about world axes.
-    """
-    jacobian = np.zeros((6, ERROR_STATES))
-    jacobian[:3, POSITION] = np.eye(3)
-    jacobian[3:, ATTITUDE] = rotations.matrix(estimate.quaternion)
-    return jacobian @ estimate.covariance @ jacobian.T
-
-
-def twist_covariance(estimate: Estimate, gyroscope_noise: float) -> np.ndarray:
-    """
-    Covariance (6, 6) of linear [m/s] and angular [rad/s] velocity in base_link.
-
-    ``gyroscope_noise`` is the standard deviation of one angular-rate sample, each axis [rad/s].
-    """
-    to_body = rotations.matrix(estimate.quaternion).T
-    jacobian = np.zeros((6, ERROR_STATES))
-    jacobian[:3, VELOCITY] = to_body
-    jacobian[:3, ATTITUDE] = rotations.skew(to_body @ estimate.velocity)
-    jacobian[3:, GYROSCOPE_BIAS] = -np.eye(3)
-    covariance = jacobian @ estimate.covariance @ jacobian.T
-    covariance[3:, 3:] += gyroscope_noise ** 2 * np.eye(3)
-    return covariance
+    def twist_covariance(self) -> np.ndarray:
+        """Covariance (6, 6) of linear [m/s] and angular [rad/s] velocity in base_link."""
+        to_body = rotations.matrix(self.quaternion).T
+        jacobian = np.zeros((6, ERROR_STATES))
+        jacobian[:3, VELOCITY] = to_body
+        jacobian[:3, ATTITUDE] = rotations.skew(to_body @ self.velocity)
+        jacobian[3:, GYROSCOPE_BIAS] = -np.eye(3)
+        covariance = jacobian @ self.covariance @ jacobian.T
+        covariance[3:, 3:] += self.gyroscope_noise ** 2 * np.eye(3)
+        return covariance

@@ -16,9 +16,10 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.bag_types import new
-from beetle_omni_ros.messages.values import Diagnostic, MessageError, Odom, Wrench
+from beetle_omni_ros.messages.values import Diagnostic, MessageError, Wrench
 from beetle_omni_ros.robot import readings, rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.mode import Mode
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 
@@ -151,7 +152,7 @@ read_battery, _write_battery = vectors(readings.BatteryReading, 'sensor_msgs/msg
                                        voltage='voltage', current='current')
 # The twist of the message is in base_link, the velocity of the value in world.
 _read_odom, _write_odom = vectors(
-    Odom, 'nav_msgs/msg/Odometry', WORLD, position='pose.pose.position xyz',
+    BodyState, 'nav_msgs/msg/Odometry', WORLD, position='pose.pose.position xyz',
     velocity='twist.twist.linear xyz', quaternion='pose.pose.orientation xyzw',
     angular_velocity='twist.twist.angular xyz')
 
@@ -175,7 +176,7 @@ def write_battery(value: readings.BatteryReading) -> Any:
     return message
 
 
-def read_odom(message: Any) -> Odom:
+def read_odom(message: Any) -> BodyState:
     """Read pose and velocity; the velocity is rotated from base_link to world."""
     odom = _read_odom(message)
     q, velocity = odom.quaternion, odom.velocity
@@ -188,17 +189,16 @@ def read_odom(message: Any) -> Odom:
 
 def write_odom(value: Any) -> Any:
     """
-    Write pose in world, twist in base_link, and covariances of an Odom.
+    Write pose in world, twist in base_link, and the covariances of an estimate.
 
-    A state, an estimate or the truth is written as an Odom without covariances.
+    What has no covariances is written without them.
     """
     message = _write_odom(value)
     message.child_frame_id = BODY
     set_parts(message.twist.twist.linear, rotations.matrix(value.quaternion).T @ value.velocity)
     for part in ('pose', 'twist'):
         if (covariance := getattr(value, f'{part}_covariance', None)) is not None:
-            getattr(message, part).covariance = np.ascontiguousarray(
-                covariance(), dtype=float).reshape(36)
+            getattr(message, part).covariance = covariance().reshape(36)
     return message
 
 

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages import conversions as c
-from beetle_omni_ros.messages.values import Diagnostic, Odom, Wrench
+from beetle_omni_ros.messages.values import Diagnostic, Wrench
 from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.mode import Mode
 from beetle_omni_ros.robot.readings import (
     BatteryReading,
@@ -104,8 +105,8 @@ def _command(name, meaning, required=False):
 
 
 def _odom(name, meaning, required=False):
-    return Topic(name, 'nav_msgs/msg/Odometry', ESTIMATE, Odom, c.read_odom, c.write_odom, meaning,
-                 ('position', 'velocity', 'quaternion', 'angular_velocity'), required=required)
+    return Topic(name, 'nav_msgs/msg/Odometry', ESTIMATE, BodyState, c.read_odom, c.write_odom,
+                 meaning, ('position', 'velocity', 'quaternion', 'angular_velocity'), required=required)
 
 
 def command_topic(controller: str) -> Topic:

@@ -17,11 +17,11 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.drive import Action, DriveParameters, Steering
 from beetle_omni_ros.messages.topics import SENSOR
-from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.runner import sigterm_as_interrupt
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs.targets import TargetChecks
@@ -45,7 +45,7 @@ class Driver(Operator):
     def __init__(self, domain: int | None, parameters: DriveParameters, robot: RobotParameters):
         super().__init__(domain)
         self._p, self._checks = parameters, TargetChecks(robot)
-        self.odom: Odom | None = None
+        self.odom: BodyState | None = None
         self.steering: Steering | None = None
         self.axes, self.buttons, self.joy_at = (), (), -np.inf
         node = self._node

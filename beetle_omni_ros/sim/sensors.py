@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.robot import readings, rotations
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.parameters import Conditions, RPM_AT_1_NEWTON, SimulatorParameters
@@ -31,15 +32,10 @@ class Impact:
     inclination: float              # angle between base_link's z axis and the vertical [rad]
 
 
-@dataclass(slots=True)
-class Truth:
+@dataclass(slots=True, eq=False)
+class Truth(BodyState):
     """The true state."""
 
-    stamp: float
-    position: np.ndarray            # (3,) of base_link in world [m]
-    velocity: np.ndarray            # (3,) of base_link's origin in world [m/s]
-    quaternion: np.ndarray          # (4,) base_link to world, xyzw
-    angular_velocity: np.ndarray    # (3,) in base_link [rad/s]
     tilt: np.ndarray                # (4,) [rad]
     tilt_velocity: np.ndarray       # (4,) [rad/s]
     thrust: np.ndarray              # (4,) present thrusts [N]

@@ -4,8 +4,6 @@ from functools import partial
 
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
-from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.stack.component import Component, ERROR, OK, WARN
@@ -20,7 +18,6 @@ class Estimator(Component):
     def __init__(self, parameters: EkfParameters, robot: RobotParameters):
         super().__init__('ekf_node')
         self.ekf = ErrorStateEkf(parameters.of_robot(robot), robot.gravity)
-        self._gyroscope_noise = parameters.imu.gyroscope_noise
         self._status = self.ekf.status
         self.writes('odom')
         self.reads('imu/data_raw', self._on_imu, max_age=SENSOR_AGE)
@@ -35,11 +32,7 @@ class Estimator(Component):
             self.host.log(INFO, f'{self._status} -> {status}')
             self._status = status
         if accepted and status in PUBLISHED:
-            estimate = self.ekf.estimate
-            self.send('odom', Odom(
-                estimate.stamp, estimate.position, estimate.velocity, estimate.quaternion,
-                estimate.angular_velocity, partial(pose_covariance, estimate),
-                partial(twist_covariance, estimate, self._gyroscope_noise)))
+            self.send('odom', self.ekf.estimate)
 
     def _estimator_status(self):
         level = {'tracking': OK, 'dead_reckoning': WARN, 'lost': ERROR}

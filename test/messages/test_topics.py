@@ -1,7 +1,6 @@
 """The table of topics: nodes and bags write the same bytes and read the same values."""
 
 from dataclasses import fields, replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -9,9 +8,10 @@ import pytest
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.bag_types import from_bytes, read_all, to_bytes
 from beetle_omni_ros.messages.topics import ALL
-from beetle_omni_ros.messages.values import Diagnostic, MessageError, Odom, Wrench
+from beetle_omni_ros.messages.values import Diagnostic, MessageError, Wrench
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.mode import Mode
 from beetle_omni_ros.robot.readings import (
     BatteryReading,
@@ -37,8 +37,7 @@ def value(topic, seed=0, stamp=STAMP):
         JointReading: lambda: JointReading(stamp, draw(size=4), draw(size=4), draw(size=4)),
         BatteryReading: lambda: BatteryReading(stamp, 24.5, -20.25),
         RotorReading: lambda: RotorReading(stamp, draw(size=4)),
-        Odom: lambda: Odom(stamp, draw(size=3), draw(size=3), turn, draw(size=3),
-                           *(partial(np.copy, draw(size=(6, 6))) for _ in range(2))),
+        BodyState: lambda: BodyState(stamp, draw(size=3), draw(size=3), turn, draw(size=3)),
         PoseTarget: lambda: PoseTarget(draw(size=3), turn, stamp),
         TrajectoryTarget: lambda: path,
         Command: lambda: Command(stamp, draw(size=4), draw(size=4)),

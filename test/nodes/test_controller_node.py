@@ -7,10 +7,10 @@ import pytest
 from rclpy.parameter import Parameter
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.nodes.control_nodes import SupervisorNode
 from beetle_omni_ros.nodes.runner import maker
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.stack import component as base
@@ -38,7 +38,8 @@ def test_an_exception_of_step_is_logged_and_reported_and_publishes_no_command(
     component.send = lambda topic, value: sent.append(value.stamp)
     component._on_joints(JointReading(1.0, np.zeros(4), np.zeros(4)))
     for stamp in (1.0, 2.0, 2.1):
-        component._on_odom(Odom(stamp, np.array([0, 0, 1.0]), np.zeros(3), LEVEL, np.zeros(3)))
+        component._on_odom(BodyState(
+            stamp, np.array([0, 0, 1.0]), np.zeros(3), LEVEL, np.zeros(3)))
     error = "controller 'failing': step raised AttributeError: 'State' object has no attribute " \
             "'positon' (bad.py:7)"
     level, text, values = component._controller_status()

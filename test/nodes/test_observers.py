@@ -13,11 +13,12 @@ from beetle_omni_ros.bringup.findings import check_topics
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.topics import SENSOR
-from beetle_omni_ros.messages.values import Diagnostic, Odom
+from beetle_omni_ros.messages.values import Diagnostic
 from beetle_omni_ros.nodes import operator, wire
 from beetle_omni_ros.nodes.graph import claim, domains_in_use
 from beetle_omni_ros.nodes.operator import Client, listen, LiveGraph
 from beetle_omni_ros.nodes.side_nodes import ViewerNode
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import ImuReading, JointReading, PoseReading
 from beetle_omni_ros.runs.bag_writer import FRAMES
@@ -104,7 +105,7 @@ def test_messages_become_a_moment(make_bench, ros_domain):
 
     def complete():
         for publisher, height in ((odom, 1.01), (truth, 1.0)):
-            publisher.publish(Odom(7.0, np.array([0.5, 0, height]), np.zeros(3), TURNED,
+            publisher.publish(BodyState(7.0, np.array([0.5, 0, height]), np.zeros(3), TURNED,
                                    np.zeros(3)))
         command.publish(Command(7.0, np.full(4, 0.2), np.array([1.0, 2, 3, 4])))
         graph.take(newest)
@@ -132,7 +133,7 @@ def test_the_viewer_node_publishes_description_and_frames(bench, monkeypatch):
 
     def complete():
         joints.publish(JointReading(1.0, np.zeros(4), np.zeros(4)))
-        odom.publish(Odom(1.0, np.ones(3), np.zeros(3), TURNED, np.zeros(3)))
+        odom.publish(BodyState(1.0, np.ones(3), np.zeros(3), TURNED, np.zeros(3)))
         return len(received) == 3
     assert bench.wait(complete)
     named = {frame.child_frame_id for name in ('/tf', '/tf_static')

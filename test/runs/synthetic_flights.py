@@ -3,8 +3,9 @@
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget
-from beetle_omni_ros.messages.values import Diagnostic, Odom, Wrench
+from beetle_omni_ros.messages.values import Diagnostic, Wrench
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
 
 TICK = 0.005
@@ -86,12 +87,13 @@ def _record(recorder, t, k, rng, position, quaternion, reference, controller):
 
 def write_truth(recorder, t, position, quaternion, velocity, angular_velocity):
     """Simulated truth; velocity in world, angular velocity in base_link."""
-    recorder.write('ground_truth/odom', Odom(t, position, velocity, quaternion, angular_velocity))
+    recorder.write('ground_truth/odom', BodyState(t, position, velocity, quaternion,
+                                                  angular_velocity))
 
 
 def write_odom(recorder, t, position, quaternion, velocity, angular_velocity):
     """Record an estimate; velocity in world."""
-    recorder.write('odom', Odom(t, position, velocity, quaternion, angular_velocity))
+    recorder.write('odom', BodyState(t, position, velocity, quaternion, angular_velocity))
 
 
 def write_imu(recorder, t, specific_force, angular_velocity):

@@ -8,8 +8,9 @@ import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.messages.values import Odom, Wrench
+from beetle_omni_ros.messages.values import Wrench
 from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.mode import Mode
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import ImuReading, JointReading, PoseReading
@@ -129,7 +130,7 @@ class Follower:
 
 def fly(desk, stamps):
     for desk.time in np.atleast_1d(stamps):
-        desk.component.feed('odom', Odom(desk.time, np.array([0, 0, 1.0]), np.zeros(3), LEVEL,
+        desk.component.feed('odom', BodyState(desk.time, np.array([0, 0, 1.0]), np.zeros(3), LEVEL,
                                          np.zeros(3)))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.messages.values import Odom
+from beetle_omni_ros.robot.body import BodyState
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.simulator import Simulator
@@ -17,7 +17,7 @@ from beetle_omni_ros.stack.simulated import SimulatedRobot
 
 TICK = 0.005
 ROBOT = RobotParameters.load()
-ODOM = Odom(1.0, np.ones(3), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3))
+ODOM = BodyState(1.0, np.ones(3), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3))
 
 
 def command(stamp):
