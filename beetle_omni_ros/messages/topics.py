@@ -106,7 +106,8 @@ def _command(name, meaning, required=False):
 
 def _odom(name, meaning, required=False):
     return Topic(name, 'nav_msgs/msg/Odometry', ESTIMATE, BodyState, c.read_odom, c.write_odom,
-                 meaning, ('position', 'velocity', 'quaternion', 'angular_velocity'), required=required)
+                 meaning, ('position', 'velocity', 'quaternion', 'angular_velocity'),
+                 required=required)
 
 
 def command_topic(controller: str) -> Topic:
