@@ -48,7 +48,7 @@ class Truth:
 
 
 def fly(robot: Robot, hidden: Hidden, *, kind: str, duration: float, seed: int,
-        multibody: bool, gust: bool, conditions: str, command_age: float) -> Truth:
+        multibody: bool, gust: bool, conditions: str) -> Truth:
     """
     Fly one course; a lost flight is tried again, calmer.
 
@@ -61,7 +61,6 @@ def fly(robot: Robot, hidden: Hidden, *, kind: str, duration: float, seed: int,
         multibody: which description of the robot.
         gust: whether a coloured wrench pushes.
         conditions: 'nominal' or 'published' latencies of the controller's state.
-        command_age: [s] from a command's stamp until the actuators execute it.
 
     Raises:
         LostFlight: lost at every attempt.
@@ -72,14 +71,13 @@ def fly(robot: Robot, hidden: Hidden, *, kind: str, duration: float, seed: int,
         course = make_course(kind, duration, rng, vigour=0.8 ** attempt)
         try:
             return _attempt(robot, hidden, kind, course, duration, rng, multibody, gust,
-                            conditions, command_age)
+                            conditions)
         except LostFlight as error:
             reason = error
     raise LostFlight(f'{kind} flight, seed {seed}: {reason}')
 
 
-def _attempt(robot, hidden, kind, course, duration, rng, multibody, gust, conditions,
-             command_age):
+def _attempt(robot, hidden, kind, course, duration, rng, multibody, gust, conditions):
     numbers = robot.numbers
     lively = kind in ('poses', 'lemniscate')
     controller = PoseController(robot, rng, lively)
@@ -88,7 +86,7 @@ def _attempt(robot, hidden, kind, course, duration, rng, multibody, gust, condit
     charge = rng.uniform(*numbers['battery']['charge'])
     plant = Plant(robot, hidden, multibody=multibody, position=course.position[0],
                   quaternion=_wxyz(course.rotation[0]), tilt=tilt, thrust=thrust,
-                  charge=charge, command_age=command_age)
+                  charge=charge, command_age=numbers['command_age'])
     step = plant.step_length
     force, torque = (draw_gust(numbers['gust'], duration, step, rng) if gust else (None, None))
     sight = Sight(numbers, conditions, rng, step)
