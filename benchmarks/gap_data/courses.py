@@ -18,7 +18,6 @@ class Course:
     Attributes:
         position, velocity, acceleration: (N, 3) in world.
         rotation: (N, 3, 3) body to world; rate (N, 3) in the reference's own axes.
-        targets: (time [s], position, quaternion x y z w) at which a new pose is asked for.
 
     """
 
@@ -27,7 +26,6 @@ class Course:
     acceleration: np.ndarray
     rotation: np.ndarray
     rate: np.ndarray
-    targets: list
 
 
 def make_course(kind: str, duration: float, rng: np.random.Generator,
@@ -46,15 +44,8 @@ def make_course(kind: str, duration: float, rng: np.random.Generator,
     times = np.arange(0.0, duration + 1.0, 1 / RATE)
     if kind == 'poses':
         knots, position, angles = _pose_table(duration, rng, vigour)
-        table = _eased(times, knots, position), _eased_rotations(times, knots, angles)
-        targets = [(t, p, Rotation.from_euler('ZYX', a).as_quat())
-                   for t, p, a in zip(knots[1::2], position[1::2], angles[1::2])]
-    elif kind == 'lemniscate':
-        table, targets = _lemniscate(times, rng), []
-    else:
-        table = _hover(times, rng)
-        targets = [(0.0, table[0][0], table[1][0].as_quat())]
-    return _differentiate(*table, targets)
+        return _course(_eased(times, knots, position), _eased_rotations(times, knots, angles))
+    return _course(*(_lemniscate if kind == 'lemniscate' else _hover)(times, rng))
 
 
 def _pose_table(duration, rng, vigour):
@@ -121,7 +112,7 @@ def _hover(times, rng):
     return place * ones, Rotation.from_rotvec(turn * ones)
 
 
-def _differentiate(position, rotation, targets):
+def _course(position, rotation):
     step = 1 / RATE
     velocity = np.gradient(position, step, axis=0)
     acceleration = np.gradient(velocity, step, axis=0)
@@ -131,4 +122,4 @@ def _differentiate(position, rotation, targets):
     last = (len(times) - 1) // every * every
     spline = RotationSpline(times[:last + 1:every], rotation[:last + 1:every])
     rate = spline(np.minimum(times, times[last]), 1)
-    return Course(position, velocity, acceleration, rotation.as_matrix(), rate, targets)
+    return Course(position, velocity, acceleration, rotation.as_matrix(), rate)

@@ -20,10 +20,9 @@ class Recording:
     Attributes:
         imu: (N, 7) stamp, specific force (3), angular rate (3).
         mocap: (N, 8) stamp, position (3), quaternion x y z w.
-        joints: (N, 9) stamp, position (4), velocity (4).
+        joints: (N, 5) stamp, position (4).
         battery: (N, 3) stamp, voltage, current (negative when discharging).
         commands: (N, 9) stamp, tilt (4), thrust (4).
-        targets: (stamp, position, quaternion x y z w) of new target poses.
         ages: seconds from stamp to arrival by the names above.
 
     """
@@ -33,7 +32,6 @@ class Recording:
     joints: np.ndarray
     battery: np.ndarray
     commands: np.ndarray
-    targets: list
     ages: dict[str, float]
 
 
@@ -57,7 +55,7 @@ def measure(truth: Truth, hidden: Hidden, numbers: dict, rng: np.random.Generato
         _imu(truth, hidden, settings, rng, noise, shape),
         _mocap(truth, hidden, settings, rng, noise),
         _joints(truth, hidden, settings, rng, noise), _battery(truth, numbers['battery'], rng),
-        commands, truth.course.targets,
+        commands,
         {'imu': 0.001, 'mocap': 0.010, 'joints': 0.010, 'battery': 0.002, 'commands': 0.001})
 
 
@@ -122,9 +120,7 @@ def _joints(truth, hidden, settings, rng, noise):
     count = 2 * np.pi / settings['counts_per_turn']
     tilt = truth.columns['tilt'][seen]
     tilt = tilt + noise['tilt'] * rng.standard_normal(tilt.shape)
-    rate = truth.columns['tilt_rate'][seen]
-    step = settings['velocity_count']
-    return np.column_stack([stamps, np.round(tilt / count) * count, np.round(rate / step) * step])
+    return np.column_stack([stamps, np.round(tilt / count) * count])
 
 
 def _battery(truth, settings, rng):

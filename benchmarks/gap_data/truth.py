@@ -10,12 +10,11 @@ import numpy as np
 import yaml
 
 HERE = Path(__file__).parent
-GROUPS = ('body', 'rotors', 'lags')
 
 
-def load_numbers(path: str | Path = HERE / 'numbers.yaml') -> dict:
+def load_numbers() -> dict:
     """Everything that stands in ``numbers.yaml``."""
-    return yaml.safe_load(Path(path).read_text())
+    return yaml.safe_load((HERE / 'numbers.yaml').read_text())
 
 
 @dataclass

@@ -26,8 +26,7 @@ def made_up(seconds=4.0):
     columns['quaternion'] = turn[:, [3, 0, 1, 2]]
     stamps = np.arange(0, seconds, 0.01)
     still = np.zeros((1, 3))
-    course = Course(still, still, still, np.eye(3)[None], still,
-                    [(0.5, np.zeros(3), np.array([0, 0, 0, 1.0]))])
+    course = Course(still, still, still, np.eye(3)[None], still)
     return Truth(t, columns, stamps, np.full((len(stamps), 4), 0.1),
                  np.full((len(stamps), 4), 7.0), course)
 
@@ -93,7 +92,7 @@ def test_a_bag_contains_the_topics_of_the_interface(tmp_path):
     write_bag(tmp_path / 'bag', recording, epoch=1_780_000_000)
     rows = read(tmp_path / 'bag')
     assert set(rows) == {'/mocap/pose', '/imu/data_raw', '/joint_states', '/battery_state',
-                         '/command', '/target_pose'}
+                         '/command'}
     received, command = rows['/command'][5]
     assert list(command.name) == [f'gimbal{i}' for i in range(1, 5)] + [
         f'rotor{i}' for i in range(1, 5)]
