@@ -107,12 +107,11 @@ def _priors(robot, keys, p, starts, coarse):
     """Names of the keys, their spreads, and the entries; ``coarse`` sensors are also late."""
     fitted = {n: key for n, key in keys.items() if not key.form and key.effect not in LIMITS
               and (n != 'modules.share' or robot.multibody is not None)}
-    tolerance = {n: float(np.max(prior.deviation)) for n, prior in tolerances(p).items()}
-    tolerance |= {TILT_BUS: p.bus_near, THRUST_BUS: p.bus_near,
-                  'imu_filter_lag.delay': p.coarse_imu if coarse else p.imu_averaging,
-                  'joint_feedback_delay.delay':
-                      p.coarse_encoders if coarse else p.tolerance_delay,
-                  'swing.ratio': p.tolerance_swing + swing_of(robot)}
+    tolerance = tolerances(p) | {
+        TILT_BUS: p.bus_near, THRUST_BUS: p.bus_near,
+        'imu_filter_lag.delay': p.coarse_imu if coarse else p.imu_averaging,
+        'joint_feedback_delay.delay': p.coarse_encoders if coarse else p.tolerance_delay,
+        'swing.ratio': p.tolerance_swing + swing_of(robot)}
     spreads = {n: spread(robot, key, tolerance.get(n, 0.0), 0.0)
                if key.effect in CATALOGUE else Spread(tolerance[n], key.typical, 0.0)
                for n, key in fitted.items()}

@@ -52,8 +52,7 @@ def _engine(flights, robot, p, declared, alpha, progress):
     if 'force_x' not in flights[0].channels:
         names -= {'imu_misalignment', 'wind', 'rotor_drag', 'body_drag'}
     keys = keys_of(robot, names)
-    tolerance = {key: float(np.max(prior.deviation))
-                 for key, prior in tolerances(p).items()}
+    tolerance = tolerances(p)
     spreads = {name: spread(robot, key, tolerance.get(name, 0.0), declared.clock_deviation)
                for name, key in keys.items()}
     free = LAGS if 'specific_force' not in declared.signals else ()  # the lag of an estimator

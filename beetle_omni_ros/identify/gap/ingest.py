@@ -241,12 +241,11 @@ def check_apart(runs: list[Path]) -> None:
         files = [run] if run.suffix.lower() in TABLES else bag_files(run)
         if not all(file.is_file() for file in files):
             continue        # reading it raises the error
-        size = tuple(file.stat().st_size for file in files)
-        digest = tuple(_digest(file) for file in files)
-        if (size, digest) in known:
-            raise ParameterError(f'{known[size, digest]} and {run}: the same recording twice; '
+        digest = tuple(hashlib.sha256(file.read_bytes()).hexdigest() for file in files)
+        if digest in known:
+            raise ParameterError(f'{known[digest]} and {run}: the same recording twice; '
                                  'expected different flights, each once')
-        known[size, digest] = run
+        known[digest] = run
 
 
 def check_flights(runs: list[Path], flights: list[Flight], same: float) -> None:
@@ -265,9 +264,3 @@ def check_flights(runs: list[Path], flights: list[Flight], same: float) -> None:
             if len(own & readings[j]) > same * min(len(own), len(readings[j])):
                 raise ParameterError(f'{runs[j]} and {runs[k]}: the same flight in two '
                                      'recordings; expected different flights, each once')
-
-
-def _digest(file):
-    with file.open('rb') as stream:
-        return hashlib.file_digest(stream, 'sha256').hexdigest() \
-            if hasattr(hashlib, 'file_digest') else hashlib.sha256(stream.read()).hexdigest()

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.inference.prior import Prior
 from beetle_omni_ros.robot.effects import CATALOGUE, delaying, ignored
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.terms import EffectParameter
@@ -137,8 +136,8 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
     return keys
 
 
-def tolerances(p: GapParameters) -> dict[str, Prior]:
-    """Priors of the keys by which every robot differs from the robot file."""
+def tolerances(p: GapParameters) -> dict[str, float]:
+    """Prior deviations of the keys by which every robot differs from the robot file."""
     result = {key: getattr(p, f'tolerance_{spec.tolerance}')
             for name, effect in CATALOGUE.items() for parameter, spec in effect.parameters.items()
             if spec.tolerance for key in names_of(name, parameter)}
@@ -148,7 +147,7 @@ def tolerances(p: GapParameters) -> dict[str, Prior]:
                    f'servo.kd[{k}]': p.tolerance_lag}
     for k in range(12):
         result[f'position.offset[{k}]'] = p.tolerance_position
-    return {name: Prior(deviation) for name, deviation in result.items()}
+    return result
 
 
 def extra_keys() -> dict[str, Key]:

@@ -108,17 +108,10 @@ class FlightModel:
 
     def _joints(self, sets):
         """Encoders minus simulated servos, [(M, 4)] for each set."""
-        groups: dict[tuple, list[int]] = {}
-        for k, theta in enumerate(sets):
-            groups.setdefault(tuple(theta.get(name, 0.0) for name in SHIFTS), []).append(k)
-        residuals: list = [None] * len(sets)
         first, count = self._starts[0], self._length * len(self._starts)
-        for members in groups.values():
-            runs = self._servos([sets[k] for k in members], sets[members[0]])
-            for k, run in zip(members, runs, strict=True):
-                read = self.signals.joints(sets[k])[3][first:first + count]
-                residuals[k] = self._of_joints(read - run.reshape(-1, 4))
-        return residuals
+        return [self._of_joints(self.signals.joints(theta)[3][first:first + count]
+                                - self._servos([theta], theta)[0].reshape(-1, 4))
+                for theta in sets]
 
     def smooth_tilts(self, theta: dict[str, float]) -> None:
         """

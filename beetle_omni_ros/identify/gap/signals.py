@@ -5,6 +5,7 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import base_of, names_of, THRUST_BUS, TILT_BUS
@@ -18,7 +19,6 @@ from beetle_omni_ros.identify.gap.series import (
     low_pass,
     matrices,
     spread,
-    turn,
     turned,
     within,
 )
@@ -130,7 +130,7 @@ class Signals:
             force, rate, turning = self._own_imu
             force, rate = force - values[:3], rate - values[3:6]
             if values[6:9].any():
-                rotation = turn(values[6:9]).T
+                rotation = Rotation.from_rotvec(values[6:9]).as_matrix().T
                 force, rate, turning = force @ rotation, rate @ rotation, turning @ rotation
             if values[9:].any():
                 lever = values[9:]
