@@ -13,7 +13,12 @@ from beetle_omni_ros.identify.flights.balance import Balance
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import Posterior
 from beetle_omni_ros.identify.flights.priors import Entry
-from beetle_omni_ros.identify.flights.quality import disagreement, errors
+from beetle_omni_ros.identify.flights.quality import (
+    discrepancy_sizes,
+    errors,
+    fitted,
+    noise_of,
+)
 from beetle_omni_ros.identify.flights.solution import log_prior, Solution
 from beetle_omni_ros.identify.flights.text import summary
 from beetle_omni_ros.identify.flights.unexplained import Unexplained, unexplained
@@ -262,16 +267,13 @@ def where_of(engine: Engine, solution: Solution) -> list[dict]:
     without discrepancy, and ``rms``, ``rms_after`` and ``discrepancy_rms`` of what repeats and is
     in no entry, with a unit.
     """
-    known, count, whitened, raw = engine.known, len(engine.names), [], []
+    known, whitened, raw = engine.known, [], []
     for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
-        x = solution.equations.of_flight(k, solution.theta)[:count]
-        x[:known] += solution.theta[:known]
-        x[known:] = 0.0
-        noise = np.sqrt(np.diagonal(found.noise, axis1=1, axis2=2))[found.band]
-        whitened.append([(r / noise).reshape(-1, len(engine.channels))
-                         for r in (found.residual, found.residual + found.slopes @ x)])
+        x = fitted(engine, solution, k)
+        whitened.append([(rest / noise_of(found)).reshape(-1, len(engine.channels))
+                         for rest in (found.residual, found.residual + found.slopes @ x)])
         raw.append([np.where(flight.mask, flight.linear(at, []).residual, np.nan)
-                    for at in ({}, dict(zip(engine.names[:known], x[:known], strict=True)))])
+                    for at in ({}, dict(zip(engine.names[:known], x, strict=False)))])
     excess, rms = (np.sqrt([np.nanmean(np.concatenate(parts)**2, axis=0)
                             for parts in zip(*own, strict=True)]) for own in (whitened, raw))
     rows: list[dict] = [
@@ -279,7 +281,8 @@ def where_of(engine: Engine, solution: Solution) -> list[dict]:
          'excess_after': float(excess[1, c]), 'rms': float(rms[0, c]),
          'rms_after': float(rms[1, c]), 'discrepancy_rms': discrepancy,
          'unit': UNITS[name.partition('_')[0]]}
-        for c, (name, _, discrepancy) in enumerate(disagreement(engine, solution))]
+        for c, (name, discrepancy) in enumerate(zip(
+            engine.channels, discrepancy_sizes(engine, solution), strict=True))]
     before = np.concatenate([parts[0] for parts in raw])
     regime = np.concatenate([regimes_of(flight.motion) for flight in engine.flights])
     for c, name in enumerate(engine.channels):
