@@ -101,10 +101,10 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
                                for j in members)) for e, s, _, _, members in found]
     rest = unexplained(engine, solution) if measured else []
     fed_back = sorted(solution.entries[k].name.replace('_', ' ') for k in solution.banned)
-    verdict = verdict_of(chance, sets, rest, fed_back, alpha)
+    verdict, reason = verdict_of(chance, sets, rest, fed_back, alpha)
     effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]
     return result_of(
-        verdict, groups, reason_of(verdict, sets, rest, fed_back, chance),
+        verdict, groups, reason,
         effects=[effect for effect, members in zip(effects, sets, strict=True)
                  if verdict in NAMING and len(members) < CROWD],
         partial=[effect for effect, members in zip(effects, sets, strict=True)
@@ -321,9 +321,9 @@ def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: li
 
 
 def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
-               fed_back: list[str], alpha: float) -> str:
+               fed_back: list[str], alpha: float) -> tuple[str, str]:
     """
-    Verdict on flights.
+    Verdict on flights and, without names, its reason as the end of a sentence.
 
     Args:
         chance: probability of as much evidence without any effect.
@@ -334,15 +334,21 @@ def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
 
     """
     if len(fed_back) > MOST_FED_BACK:
-        return 'not_decidable'
+        return 'not_decidable', (
+            'the controller answers noise more than it flies: the values of '
+            f"{', '.join(fed_back)} differ between frequencies")
     small = [len(members) for members in sets if len(members) < CROWD]
     if small:
-        return 'named_set' if max(small) > 1 else 'named'
+        return 'named_set' if max(small) > 1 else 'named', ''
     if sets:
-        return 'not_decidable'
+        return 'not_decidable', (
+            f"they do not separate {' and '.join(map(' or '.join, sets))}".replace('_', ' '))
     if rest and rest[0].probability < alpha / TESTS:
-        return 'unknown'
-    return 'no_gap' if chance > alpha else 'not_decidable'
+        return 'unknown', rest[0].sentence
+    if chance > alpha:
+        return 'no_gap', ''
+    return 'not_decidable', ('an effect is more likely than none, but a false alarm would have '
+                             f'the probability {chance:.2g}')
 
 
 def varied(engine: Engine, solution: Solution) -> list[str]:
@@ -358,19 +364,3 @@ def varied(engine: Engine, solution: Solution) -> list[str]:
             found.append(f"{entry.name.replace('_', ' ')} differs from flight to flight: "
                          + ', '.join(f'{value:.2g}' for value in values) + f' {unit}')
     return found
-
-
-def reason_of(verdict: str, sets: list[list[str]], rest: list[Unexplained],
-              fed_back: list[str], chance: float) -> str:
-    """Why a verdict without names was reached, as the end of a sentence."""
-    if verdict == 'unknown':
-        return rest[0].sentence
-    if verdict != 'not_decidable':
-        return ''
-    if len(fed_back) > MOST_FED_BACK:
-        return ('the controller answers noise more than it flies: the values of '
-                f"{', '.join(fed_back)} differ between frequencies")
-    if sets:
-        return f"they do not separate {' and '.join(map(' or '.join, sets))}".replace('_', ' ')
-    return ('an effect is more likely than none, but a false alarm would have the probability '
-            f'{chance:.2g}')

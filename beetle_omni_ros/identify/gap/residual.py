@@ -15,7 +15,14 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import delays_of, Key
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.servo import simulate, targets_at, windows_at
+from beetle_omni_ros.identify.gap.servo import (
+    module_load,
+    simulate,
+    spin_load,
+    targets_at,
+    undescribed_load,
+    Windows,
+)
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import NUMPY, Servo
@@ -182,7 +189,11 @@ class FlightModel:
         at = self._starts - round(p.servo_warm_up / p.grid)
         middle = edges[:, :-1] + p.servo_step / 2
         index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
-        return windows_at(s, theta, index, (tilt[at], rate[at]), s.thrust({})[0], skip), edges
+        loads = (s.thrust({})[0], module_load(s, theta), spin_load(s, theta),
+                 *undescribed_load(s, theta))
+        force, load, spin, *more = (series[index].transpose(1, 0, 2) for series in loads)
+        return Windows(tilt[at], rate[at], force, load, spin, p.servo_step, skip,
+                       round(p.grid / p.servo_step), tuple(more)), edges
 
 
 def limit_starts(key, effect, models):
