@@ -5,25 +5,26 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
 from beetle_omni_ros.runs.bag_writer import BagWriter
-from gap_data.sensors import Recording
 
-# table of a recording -> topic, message, columns of its values after the stamp
+# table of a recording -> topic, message, columns of its values, seconds from stamp to arrival
 TABLES = {
-    'imu': ('imu/data_raw', ImuReading, (slice(1, 4), slice(4, 7))),
-    'mocap': ('mocap/pose', PoseReading, (slice(1, 4), slice(4, 8))),
-    'joints': ('joint_states', partial(JointReading, velocity=None), (slice(1, 5),)),
-    'battery': ('battery_state', BatteryReading, (1, 2)),
-    'commands': ('command', Command, (slice(1, 5), slice(5, 9)))}
+    'imu': ('imu/data_raw', ImuReading, (slice(1, 4), slice(4, 7)), 0.001),
+    'mocap': ('mocap/pose', PoseReading, (slice(1, 4), slice(4, 8)), 0.010),
+    'joints': ('joint_states', partial(JointReading, velocity=None), (slice(1, 5),), 0.010),
+    'battery': ('battery_state', BatteryReading, (1, 2), 0.002),
+    'commands': ('command', Command, (slice(1, 5), slice(5, 9)), 0.001)}
 
 
-def write_bag(path: str | Path, recording: Recording, *, epoch: int) -> None:
-    """Write one flight to a new folder; ``epoch``: UNIX time at which the flight began [s]."""
-    entries = [(float(row[0]) + recording.ages[table], topic, message(
-        float(row[0]), *(row[part] for part in parts)))
-        for table, (topic, message, parts) in TABLES.items() for row in getattr(recording, table)]
+def write_bag(path: str | Path, recording: dict[str, np.ndarray], *, epoch: int) -> None:
+    """Write a :func:`~gap_data.sensors.measure`; ``epoch``: UNIX time of its beginning [s]."""
+    entries = [(float(row[0]) + age, topic, message(float(row[0]), *(row[part] for part in parts)))
+               for table, (topic, message, parts, age) in TABLES.items()
+               for row in recording[table]]
     with BagWriter(path, topics=[topic for topic, *_ in TABLES.values()], epoch=epoch) as bag:
         for received, topic, value in sorted(entries, key=lambda entry: entry[0]):
             bag.write(topic, value, received)

@@ -88,17 +88,16 @@ def make_cases(which: str, seed: int) -> list[Case]:
         for kind, count in counts.items():
             rng = np.random.default_rng([seed, DIFFICULTIES.index(difficulty),
                                          KINDS.index(kind)])
-            cases += [DRAW[kind](settings, difficulty, k, rng) for k in range(count)]
+            cases += [_case(settings, kind, difficulty, k, rng) for k in range(count)]
     return cases
 
 
-def _base(settings, difficulty, k, rng, kind, **more) -> Case:
-    fields = {'kind': kind, 'difficulty': difficulty, 'seed': int(rng.integers(2 ** 31)),
-              **settings['flights']}
-    if difficulty == 'hard':
-        fields |= {'multibody': True, 'gust': True, 'tolerance': True,
-                   'conditions': ('published', 'nominal')[k % 2]}
-    return Case(**(fields | more))
+def _case(settings, kind, difficulty, k, rng) -> Case:
+    drawn = DRAW[kind](settings, difficulty, k, rng)
+    hard = {'multibody': True, 'gust': True, 'tolerance': True,
+            'conditions': ('published', 'nominal')[k % 2]} if difficulty == 'hard' else {}
+    return Case(kind, difficulty, **{'seed': int(rng.integers(2 ** 31)), **settings['flights'],
+                                     **hard, **drawn})
 
 
 def _effect(settings, name, difficulty, rng):
@@ -118,39 +117,33 @@ def _single(settings, difficulty, k, rng):
     names = list(settings['effects'])
     order = np.random.default_rng(5).permutation(len(names))  # spread over layers in small sets
     name = names[order[k % len(names)]]
-    effect = _effect(settings, name, difficulty, rng)
-    plant = {'multibody': True} if name == 'module_reaction' else {}
-    return _base(settings, difficulty, k, rng, 'singles', effects=(effect,), **plant)
+    return {'effects': (_effect(settings, name, difficulty, rng),),
+            'multibody': name == 'module_reaction' or difficulty == 'hard'}
 
 
 def _none(settings, difficulty, k, rng):
-    harder = {'noise': 2.0 if k % 4 == 3 else 1.0,
-              'course': 'lemniscate' if k % 5 == 4 else 'poses'}
-    if difficulty == 'hard':  # each hardship also alone
-        harder |= [{}, {'multibody': False}, {'gust': False}, {'tolerance': False}][k % 4]
-    return _base(settings, difficulty, k, rng, 'none', **harder)
+    hard = [{}, {'multibody': False}, {'gust': False}, {'tolerance': False}][k % 4] \
+        if difficulty == 'hard' else {}      # each hardship also alone
+    return {'noise': 2.0 if k % 4 == 3 else 1.0,
+            'course': 'lemniscate' if k % 5 == 4 else 'poses', **hard}
 
 
 def _pair(settings, difficulty, k, rng):
     pair = settings['pairs'][k % len(settings['pairs'])]
-    return _base(settings, difficulty, k, rng, 'pairs',
-                 effects=tuple(_effect(settings, name, difficulty, rng) for name in pair))
+    return {'effects': tuple(_effect(settings, name, difficulty, rng) for name in pair)}
 
 
 def _outside(settings, difficulty, k, rng):
-    names = list(settings['outside'])
-    name = names[k % len(names)]
+    name = list(settings['outside'])[k % len(settings['outside'])]
     size = float(rng.uniform(*settings['outside'][name]['range']))
-    return _base(settings, difficulty, k, rng, 'outside', effects=((name, size, 'plain'),))
+    return {'effects': ((name, size, 'plain'),)}
 
 
 def _undecidable(settings, difficulty, k, rng):
-    names = list(settings['undecidable'])
-    effect = _effect(settings, names[k % len(names)], 'clean', rng)
-    return _base(settings, difficulty, k, rng, 'undecidable', effects=(effect,),
-                 course='hover')
+    name = list(settings['undecidable'])[k % len(settings['undecidable'])]
+    return {'effects': (_effect(settings, name, 'clean', rng),), 'course': 'hover'}
 
 
-DRAW: dict[str, Callable[..., Case]] = {
+DRAW: dict[str, Callable[..., dict]] = {
     'singles': _single, 'none': _none, 'pairs': _pair, 'outside': _outside,
     'undecidable': _undecidable}

@@ -27,7 +27,7 @@ EPOCH = 1_780_000_000  # [s] a wall clock
 def build(case: Case) -> tuple[Robot, Hidden, list[dict]]:
     """The true robot of a case, its hidden effects, and the label of each; always the same."""
     rng = np.random.default_rng([case.seed, 1])
-    robot, hidden = Robot.nominal(), Hidden()
+    robot, hidden = Robot(), Hidden()
     if case.tolerance:
         robot.within_tolerance(rng)
     labels = []

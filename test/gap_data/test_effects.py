@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 SETTINGS = load_settings()
 ALL = [(name, shape) for name in CATALOGUE for shape in ('plain', *SHAPES.get(name, ()))]
 UP = (0.0, 0.0, 1.0)
-HOVER, LOW = Robot.nominal().hover_thrust, Robot.nominal().positions[0, 2]
+HOVER, LOW = Robot().hover_thrust, Robot().positions[0, 2]
 
 
 def put(name, size, shape='plain', seed=0):
-    robot, hidden = Robot.nominal(), Hidden()
+    robot, hidden = Robot(), Hidden()
     label = inject(name, robot, hidden, size, shape, np.random.default_rng(seed))
     return robot, hidden, label
 

@@ -38,20 +38,19 @@ def sample(hidden=None, noise=SILENT, truth=None, seed=0):
 
 def test_stamps_are_capture_times_at_the_interface_rates():
     truth, recording = made_up(), sample()
-    for table, rate in ((recording.imu, 200), (recording.mocap, 100), (recording.joints, 200),
-                        (recording.battery, 10)):
-        assert np.diff(table[:, 0]) == pytest.approx(1 / rate)
-    assert recording.imu[:, 1:4] == pytest.approx(truth.columns['specific_force'][::5])
-    assert recording.mocap[:, 1:4] == pytest.approx(truth.columns['position'][::10])
-    assert np.abs(recording.joints[:, 1:5] - truth.columns['tilt'][::5]).max() <= (
+    for name, rate in (('imu', 200), ('mocap', 100), ('joints', 200), ('battery', 10)):
+        assert np.diff(recording[name][:, 0]) == pytest.approx(1 / rate)
+    assert recording['imu'][:, 1:4] == pytest.approx(truth.columns['specific_force'][::5])
+    assert recording['mocap'][:, 1:4] == pytest.approx(truth.columns['position'][::10])
+    assert np.abs(recording['joints'][:, 1:5] - truth.columns['tilt'][::5]).max() <= (
         np.pi / 4096 + 1e-12)
 
 
 def test_delays_make_readings_older_than_their_stamps():
     old = sample(Hidden(mocap_delay=0.02, joint_feedback_delay=0.015))
     now = sample()
-    assert old.mocap[10:, 1:4] == pytest.approx(now.mocap[8:-2, 1:4])
-    assert old.joints[10:, 1:5] == pytest.approx(now.joints[7:-3, 1:5])
+    assert old['mocap'][10:, 1:4] == pytest.approx(now['mocap'][8:-2, 1:4])
+    assert old['joints'][10:, 1:5] == pytest.approx(now['joints'][7:-3, 1:5])
 
 
 @pytest.mark.parametrize('shape', ['plain', 'butterworth'])
@@ -67,11 +66,12 @@ def test_biases_and_mounting_appear_in_readings():
                     gyroscope_bias=np.array([0.01, 0, 0]), mocap_rotation=rotation)
     askew, straight = sample(hidden), sample()
     turn = Rotation.from_rotvec(rotation)  # sensor axes seen from base_link
-    assert askew.imu[:, 1:4] == pytest.approx(
-        turn.inv().apply(straight.imu[:, 1:4]) + [0.1, 0.2, 0.3])
-    assert askew.imu[:, 4:] == pytest.approx(turn.inv().apply(straight.imu[:, 4:]) + [0.01, 0, 0])
-    seen = Rotation.from_quat(straight.mocap[:, 4:]).inv() * Rotation.from_quat(askew.mocap[:, 4:])
-    assert seen.as_rotvec() == pytest.approx(np.tile(rotation, (len(askew.mocap), 1)))
+    force, rate = (turn.inv().apply(straight['imu'][:, part]) for part in (
+        slice(1, 4), slice(4, 7)))
+    assert askew['imu'][:, 1:4] == pytest.approx(force + [0.1, 0.2, 0.3])
+    assert askew['imu'][:, 4:] == pytest.approx(rate + [0.01, 0, 0])
+    before, after = (Rotation.from_quat(made['mocap'][:, 4:]) for made in (straight, askew))
+    assert (before.inv() * after).as_rotvec() == pytest.approx(np.tile(rotation, (len(after), 1)))
 
 
 def read(path):
@@ -103,5 +103,5 @@ def test_a_bag_contains_the_topics_of_the_interface(tmp_path):
     assert received >= stamp(command)
     _, imu = rows['/imu/data_raw'][3]
     assert imu.orientation_covariance[0] == -1
-    assert imu.linear_acceleration.x == pytest.approx(recording.imu[3, 1])
-    assert imu.angular_velocity.z == pytest.approx(recording.imu[3, 6])
+    assert imu.linear_acceleration.x == pytest.approx(recording['imu'][3, 1])
+    assert imu.angular_velocity.z == pytest.approx(recording['imu'][3, 6])
