@@ -84,11 +84,6 @@ def test_a_column_of_the_format_that_the_table_lacks_is_named(tmp_path):
         read_flight(path, declared(tmp_path))
 
 
-@pytest.mark.parametrize('name', ['nanobench', 'crazypad_motor'])
-def test_shipped_formats_load(name):
-    assert Format.load(name).name == name
-
-
 def test_an_unknown_format_names_the_shipped_ones():
     with pytest.raises(ParameterError, match='crazypad_motor, nanobench'):
         Format.load('px4')

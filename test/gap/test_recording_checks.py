@@ -136,10 +136,6 @@ def interleaved(made):
     return made
 
 
-def stale(made):
-    return of(IMU, 0, 6, lambda v: v[np.arange(len(v)) // 2 * 2])(made)
-
-
 def reordered(made):
     order = np.arange(len(made.times[POSE]))
     for k in range(10, len(order) - 10, 20):
@@ -159,12 +155,6 @@ def flipped_from_half(made):
     late = late_half(made, POSE)
     q = Rotation.from_quat(made.values[POSE][late, 3:]) * QUARTER
     made.values[POSE][late, 3:] = q.as_quat()
-    return made
-
-
-def drifting(made):
-    t = made.times[POSE]
-    made.times[POSE] = t + 0.01 * (t - t[0])
     return made
 
 
@@ -194,6 +184,7 @@ def silent_clock(change):
 
 
 QUARTER = Rotation.from_euler('z', 90, degrees=True)
+drifting = stamped(POSE, lambda t: t + 0.01 * (t - t[0]))
 BOTH = slice(0, 3), slice(3, 6)
 # name -> damage, topic, words of which the cause must contain one, time [s] or None
 KINDS = {
@@ -235,7 +226,7 @@ KINDS = {
                         None),
     'IMU turned on the way': (turned(IMU, BOTH, QUARTER, late=True), IMU, ['turned'], HALF),
     'IMU spike': (spiked(IMU, 3000, 1, 1e6), IMU, ['spike'], 15.0),
-    'IMU stale': (stale, IMU, ['repeat'], None),
+    'IMU stale': (of(IMU, 0, 6, lambda v: v[np.arange(len(v)) // 2 * 2]), IMU, ['repeat'], None),
     'gyroscope clipped': (of(IMU, 3, 6, lambda v: np.clip(v, -0.5, 0.5)), IMU, ['clipped'], None),
     'one gyroscope axis frozen': (frozen(IMU, 12, 20, 4), IMU, ['frozen'], 12.0),
     'joints swapped': (of(JOINTS, 0, 4, lambda v: v[:, [1, 0, 2, 3]]), JOINTS, ['swapped'], None),

@@ -4,6 +4,7 @@ from gap_data.cases import load_settings
 from gap_data.effects import CATALOGUE, inject, SHAPES
 from gap_data.hidden import Hidden, Snapshot
 from gap_data.plant import Plant
+from gap_data.rotors import Rotors
 from gap_data.truth import Robot
 import numpy as np
 import pytest
@@ -105,7 +106,6 @@ def test_gyroscopic_torque_is_the_change_of_angular_momentum(shape):
 @shapes('rotor_lag')
 def test_rotor_lag_delays_thrust_by_its_time_constant(shape):
     robot, hidden, label = put('rotor_lag', 0.03, shape)
-    from gap_data.rotors import Rotors
     delays = []
     for low, high in ((5.0, 6.0), (6.0, 5.0)):
         rotors = Rotors(robot, hidden, 0.001, [low] * 4)

@@ -109,9 +109,8 @@ HARD = {'multibody': True, 'gust': True, 'conditions': 'published'}
 CLEAN = {'multibody': False, 'gust': False, 'conditions': 'nominal'}
 
 
-def flown(kind, seconds, difficulty, robot=None, hidden=None):
-    return fly(robot or Robot(), hidden or Hidden(), kind=kind, duration=seconds, seed=2,
-               **difficulty)
+def flown(kind, seconds, difficulty, robot=None):
+    return fly(robot or Robot(), Hidden(), kind=kind, duration=seconds, seed=2, **difficulty)
 
 
 @pytest.mark.parametrize('difficulty', [CLEAN, HARD], ids=['clean', 'hard'])
@@ -130,7 +129,7 @@ def test_a_robot_that_cannot_fly_gives_a_lost_flight():
     robot = Robot()
     robot.thrust_scale = np.full(4, 0.3)
     with pytest.raises(LostFlight, match='poses flight, seed 2'):
-        fly(robot, Hidden(), kind='poses', duration=5.0, seed=2, **CLEAN)
+        flown('poses', 5.0, CLEAN, robot)
 
 
 def test_a_hidden_effect_appears_in_flight_with_its_size():

@@ -1,6 +1,5 @@
 """Readings of the blind sensors, and their bags."""
 
-
 from gap_data.bags import write_bag
 from gap_data.courses import Course
 from gap_data.flight import COLUMNS, Truth
