@@ -16,7 +16,7 @@ import yaml
 from beetle_omni_ros.identify.gap.bags import read_recording
 from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.recording.check import repaired
+from beetle_omni_ros.identify.recording.check import checked
 from beetle_omni_ros.identify.recording.damage import changed
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.identify.recording.readings import sensor_damages
@@ -339,11 +339,11 @@ def test_a_joint_that_rests_until_its_command_arrives_is_not_frozen(seed):
     rng, limits = np.random.default_rng(seed), RecordingLimits.load()
     size, lag = rng.choice([-1, 1]) * rng.uniform(0.27, 0.35), rng.uniform(0, 0.3)
     for end in (rng.uniform(0, lag), rng.uniform(lag, 1.0), 10.0):
-        found = sensor_damages(joint_step(size, lag, end), limits)
+        found = sensor_damages(joint_step(size, lag, end))
         assert not found, (size, lag, end, found[0].text)
     # Frozen at any time before the step, it is found once every valid servo would have turned.
     held = joint_step(size, lag, limits.servo_lag[1] + 0.1, frozen_from=0.0)
-    damage, = sensor_damages(held, limits)
+    damage, = sensor_damages(held)
     assert damage.topic == JOINTS and 'gimbal2 is frozen' in damage.cause
 
 
@@ -353,7 +353,7 @@ def test_a_joint_that_rests_until_its_command_arrives_is_not_frozen(seed):
                                   'IMU spike', 'IMU stale', 'IMU upside down', 'marker flips'])
 def test_a_repair_restores_the_sound_recording(kind):
     sound = recording()
-    fixed, done, left = repaired(KINDS[kind][0](recording()), ROBOT)
+    fixed, done, left = checked(KINDS[kind][0](recording()), ROBOT, 0.0, fix=True)
     assert done and left == []
     for topic in (IMU, POSE, JOINTS, COMMAND):
         t = sound.times[topic]

@@ -99,6 +99,7 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
     taken = [[k for e, _, _, k, _ in found if e is test[0]] for test in tests]
     sets = [list(dict.fromkeys(s.entries[j].label if e is slow else s.entries[j].name
                                for j in members)) for e, s, _, _, members in found]
+    rows = [candidates_of(s, own) for (_, s, _), own in zip(tests, taken, strict=True)]
     rest = unexplained(engine, solution) if measured else []
     fed_back = sorted(solution.entries[k].name.replace('_', ' ') for k in solution.banned)
     verdict, reason = verdict_of(chance, sets, rest, fed_back, alpha)
@@ -109,9 +110,9 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
                  if verdict in NAMING and len(members) < CROWD],
         partial=[effect for effect, members in zip(effects, sets, strict=True)
                  if verdict not in NAMING or len(members) >= CROWD],
-        candidates=sorted((row for (_, s, _), own in zip(tests, taken, strict=True)
-                           for row in candidates_of(s, own)), key=_rank, reverse=True),
-        hidden=[name for _, s, _ in tests for name in hidden_of(s, alpha / len(tests))],
+        candidates=sorted((row for own in rows for row in own), key=_rank, reverse=True),
+        hidden=[name for (_, s, _), own in zip(tests, rows, strict=True)
+                for name in hidden_of(own, len(s.entries), alpha / len(tests))],
         where=where_of(engine, solution), false_alarm_probability=chance,
         held_out=held_out, findings=[*findings, *varied(engine, solution), *(
             test.sentence[:1].upper() + test.sentence[1:] for test in rest
@@ -247,14 +248,16 @@ def _rank(row):
     return row['accepted'], -np.inf if gain is None else gain
 
 
-def hidden_of(solution: Solution, alpha: float) -> list[str]:
-    """Entries that would not be named at their typical size: their mean evidence is too small."""
-    count = len(solution.entries)
+def hidden_of(rows: list[dict], count: int, alpha: float) -> list[str]:
+    """
+    Entries that would not be named at their typical size: their mean evidence is too small.
+
+    ``rows``: of :func:`candidates_of`; ``count``: number of entries.
+    """
     best: dict[str, float] = {}
+    for row in rows:
+        best[row['name']] = max(best.get(row['name'], -np.inf), row['expected_ln_bayes_factor'])
     least = log(1 / alpha) + log_prior(0, count) - log_prior(1, count)
-    for row in candidates_of(solution, []):
-        name = row['name']
-        best[name] = max(best.get(name, -np.inf), row['expected_ln_bayes_factor'])
     return [name for name, evidence in best.items() if evidence < least]
 
 

@@ -130,7 +130,10 @@ def turned(quaternion, vector):
 
 
 def aligned(quaternion):
-    """Quaternions (N, 4) with continuous signs."""
-    sign = np.sign((quaternion[1:] * quaternion[:-1]).sum(axis=1))
-    sign[sign == 0] = 1
-    return quaternion * np.concatenate([[1.0], np.cumprod(sign)])[:, None]
+    """Quaternions (N, 4) with continuous signs; rows without numbers stay."""
+    out = np.array(quaternion)
+    there = np.flatnonzero(np.isfinite(out).all(axis=1))
+    flips = np.sign((out[there[1:]] * out[there[:-1]]).sum(axis=1))
+    flips[flips == 0] = 1
+    out[there] *= np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+    return out
