@@ -22,6 +22,7 @@ from beetle_omni_ros.identify.gap.series import (
     turned,
     within,
 )
+from beetle_omni_ros.identify.recording.signals import white_noise
 from beetle_omni_ros.robot.effects import CATALOGUE, ignored
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import play
@@ -81,8 +82,7 @@ class Signals:
         third = np.abs(np.diff(flight.joint, 3, axis=0))
         self.reading_noise = float(np.median(np.sqrt((np.minimum(third, np.quantile(
             third, 0.9, axis=0))**2).mean(axis=0) / 20)))
-        third = np.diff(flight.pose[:, :3], 3, axis=0)
-        self.position_noise = float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20))
+        self.position_noise = float(np.median(white_noise(flight.pose[:, :3])))
         self.model_tilts: np.ndarray | None = None
 
     def use_model_tilts(self, model_tilts: np.ndarray) -> None:
