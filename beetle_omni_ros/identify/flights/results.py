@@ -255,7 +255,7 @@ def hidden_of(rows: list[dict], count: int, alpha: float) -> list[str]:
     ``rows``: of :func:`candidates_of`; ``count``: number of entries.
     """
     best: dict[str, float] = {}
-    for row in rows:
+    for row in sorted(rows, key=lambda row: _rank(row)[1], reverse=True):
         best[row['name']] = max(best.get(row['name'], -np.inf), row['expected_ln_bayes_factor'])
     least = log(1 / alpha) + log_prior(0, count) - log_prior(1, count)
     return [name for name, evidence in best.items() if evidence < least]
