@@ -10,7 +10,6 @@ interrupted campaign.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import os
 from pathlib import Path
@@ -27,10 +26,7 @@ sys.path[:0] = PLACES       # this tree's package, whatever is installed
 from gap_data.campaign import code_key, run_campaign  # noqa: E402
 from gap_data.cases import DIFFICULTIES, KINDS, load_settings, make_cases  # noqa: E402
 from gap_data.effects import CATALOGUE, OUTSIDE  # noqa: E402
-from gap_data.make import ROBOT_FILE  # noqa: E402
-from gap_data.page import markdown  # noqa: E402
-from gap_data.score import score  # noqa: E402
-from gap_data.truth import load_numbers  # noqa: E402
+from gap_data.score import markdown, score  # noqa: E402
 
 from beetle_omni_ros.evaluation.campaign import workers  # noqa: E402
 
@@ -48,22 +44,13 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--tool', default=TOOL, help='command before `gap` (this tree)')
     parser.add_argument('--flights-only', action='store_true', help='make the flights, ask nobody')
     parser.add_argument('--folder', type=Path, default=Path('runs_out/gap_campaign'))
-    parser.add_argument('--sealed', type=Path, help='where labels are kept (FOLDER/sealed)')
-    parser.add_argument('--output', type=Path, help='where the report goes (FOLDER)')
-    parser.add_argument('--robot', type=Path, default=ROBOT_FILE, help='file for the tool')
-    parser.add_argument('--command-age', type=float, default=load_numbers()['command_age'],
-                        metavar='S', help="from a command's stamp until it acts (%(default)s)")
     parser.add_argument('--jobs', type=int, help='at a time (every core)')
-    parser.add_argument('--timeout', type=float, default=300.0, metavar='S', help='for a case')
-    parser.add_argument('--fresh', action='store_true', help='ask again where an answer is kept')
     given = parser.parse_args(arguments)
     unknown = {*filter(None, given.only.split(','))} - {*KINDS, *DIFFICULTIES, *CATALOGUE,
                                                          *OUTSIDE}
     if unknown:
         parser.error(f"--only '{given.only}': no kind, difficulty or effect is called "
                      f"{', '.join(sorted(unknown))}")
-    if not given.robot.is_file():
-        parser.error(f"--robot '{given.robot}': no such file")
     return given
 
 
@@ -72,7 +59,7 @@ def chosen(given: argparse.Namespace) -> list:
     names = {*filter(None, given.only.split(','))}
     kinds, difficulties = names & set(KINDS), names & set(DIFFICULTIES)
     effects = names - kinds - difficulties
-    cases = [c for c in make_cases(load_settings(), given.set, given.seed, given.command_age)
+    cases = [c for c in make_cases(given.set, given.seed)
              if c.kind in (kinds or KINDS) and c.difficulty in (difficulties or DIFFICULTIES)
              and (not effects or effects & {e[0] for e in c.effects})]
     if given.cases is not None and given.cases < len(cases):
@@ -87,26 +74,21 @@ def main(arguments: list[str] | None = None) -> int:
     os.environ['PYTHONPATH'] = os.pathsep.join(filter(None, [
         *PLACES, os.environ.get('PYTHONPATH', '')]))     # for the workers and the tool
     cases, folder = chosen(given), given.folder.resolve()
-    version = code_key([HERE.parent / 'beetle_omni_ros']) + hashlib.sha256(
-        given.robot.read_bytes()).hexdigest()
+    version = code_key(HERE.parent / 'beetle_omni_ros')
     with Progress(console=Console(stderr=True)) as bars, workers(jobs=given.jobs):
         bar = bars.add_task('cases', total=len(cases))
-        judged = run_campaign(
-            cases, '' if given.flights_only else given.tool, folder, version=version,
-            sealed=given.sealed, robot_file=given.robot.resolve(), fresh=given.fresh,
-            timeout=given.timeout, done=lambda *_: bars.advance(bar))
+        judged = run_campaign(cases, '' if given.flights_only else given.tool, folder,
+                              version=version, done=lambda: bars.advance(bar))
     if given.flights_only:
         print(f'{len(cases)} cases in {folder}')
         return 0
     words = [f'--{name} {value}' for name in ('set', 'seed', 'cases', 'only')
              if (value := getattr(given, name)) not in (None, '')]
-    report = {'meta': {'cases': len(cases), 'lost': len(cases) - len(judged), 'code': version[:8],
+    report = {'meta': {'cases': len(cases), 'lost': len(cases) - len(judged), 'code': version,
                        'command': ' '.join(['python benchmarks/gap_campaign.py', *words])},
-              **score(judged), 'judged': judged}
-    output = (given.output or folder).resolve()
-    output.mkdir(parents=True, exist_ok=True)
-    (output / 'report.json').write_text(json.dumps(report, indent=1))
-    (output / 'report.md').write_text(markdown(report))
+              'criteria': score(judged), 'judged': judged}
+    (folder / 'report.json').write_text(json.dumps(report, indent=1))
+    (folder / 'report.md').write_text(markdown(report))
     Console().print(Markdown(markdown(report)))
     return 0
 

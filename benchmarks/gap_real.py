@@ -37,30 +37,51 @@ BUILD = 'NanoBench-state-A'
 ROBOT = share_path('params/crazyflie.yaml')
 
 
-def halves(folder):
-    """Flights of the build with most flights, in two halves."""
+def labels(folder):
+    """Rows of the table of the flights, by name of the file."""
     with open(folder / 'labels.csv', newline='', encoding='utf-8') as file:
-        names = sorted(row['file'] for row in csv.DictReader(file) if row['vehicle'] == BUILD)
-    paths = [folder / name for name in names]
-    return paths[::2], paths[1::2]
+        return sorted(csv.DictReader(file), key=lambda row: row['file'])
+
+
+def sizes(effects):
+    """Names and scalar sizes of effects in one line."""
+    return '; '.join(' or '.join(effect['members']) + ' ' + ', '.join(
+        f"{p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}]"
+        for p in effect['parameters'].values() if not isinstance(p['value'], list))
+        for effect in effects)
 
 
 def analysed(case, fitted, judging, robot, apply=None):
-    """One row of the table."""
+    """One row of the table of NanoBench."""
     result = gap_results(fitted, judging, robot, apply, form='nanobench',
                          console=Console(quiet=True))
-    effects = [f"{' or '.join(e['names'])} " + ', '.join(
-        f"{p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}]"
-        for p in e['parameters'].values() if not isinstance(p['value'], list))
-        for e in result['effects'] or result['partial']]
-    row = {'case': case, 'verdict': result['verdict'], 'effects': effects,
-           'false_alarm_probability': result['false_alarm_probability'],
-           'gap_before': result['gap_before'], 'gap_after': result['gap_after'],
-           'closure': result['closure'],
-           'torque_used': result['groups']['torque']['used']}
-    print(f"| {case} | {row['verdict']} | {'; '.join(effects)} | {row['gap_before']:.2f} | "
-          f"{row['gap_after']:.2f} |", flush=True)
-    return row
+    print(f"| {case} | {result['verdict']} | {sizes(result['effects'] or result['partial'])} | "
+          f"{result['gap_before']:.2f} | {result['gap_after']:.2f} |", flush=True)
+    return {'case': case, **result}
+
+
+def nanobench(folder):
+    """One row for each case."""
+    paths = [folder / row['file'] for row in labels(folder) if row['vehicle'] == BUILD]
+    one, two = paths[::2], paths[1::2]
+    print('| case | verdict | effects, 95 % | gap before | after |')
+    print('| --- | --- | --- | --- | --- |')
+    with tempfile.TemporaryDirectory() as temporary:
+        def robot(name, effects):
+            path = Path(temporary, f'{name}.yaml')
+            path.write_text(yaml.safe_dump({'extends': str(ROBOT), 'effects': effects}))
+            return path
+
+        corrected, bare = Path(temporary, 'corrected.yaml'), robot('bare', {})
+        rows = [analysed('literature, half 1', one, two, ROBOT, corrected),
+                analysed('literature, half 2', two, one, ROBOT),
+                analysed('without voltage, half 1', one, two, bare),
+                analysed('without voltage, half 2', two, one, bare)]
+        effects = yaml.safe_load(corrected.read_text())['effects']
+        rows += [analysed(f'corrected by half 1 without {name}, half 2', two, one, robot(
+            name, {other: values for other, values in effects.items() if other != name}))
+            for name in effects]
+        return [*rows, analysed('corrected by half 1, half 2', two, one, corrected)]
 
 
 def holding(cause):
@@ -74,22 +95,21 @@ def holding(cause):
 
 def crazypad(folder):
     """One row for each set of flights: cause, names, and whether they hold the cause."""
-    with open(folder / 'labels.csv', newline='', encoding='utf-8') as file:
-        flights = sorted((row['vehicle'], row['cause'], folder / row['file'])
-                         for row in csv.DictReader(file) if row['file'].startswith('pad_motor'))
+    flights = sorted((row['vehicle'], row['cause'], folder / row['file'])
+                     for row in labels(folder) if row['file'].startswith('pad_motor'))
+    print('| cause | flights | reference | verdict | effects, 95 % | probability | |')
+    print('| --- | --- | --- | --- | --- | --- | --- |')
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
-        robots = {'': ROBOT}
-        for vehicle, cause, path in flights:
-            if cause == 'normal_flight':
-                robots[f'{vehicle} {path.name}'] = centred(path, Path(temporary, path.stem))
+        robots = {'': ROBOT} | {
+            f'{vehicle} {path.name}': centred(path, Path(temporary, f'{path.stem}.yaml'))
+            for vehicle, cause, path in flights if cause == 'normal_flight'}
         for (vehicle, cause), group in groupby(flights, key=lambda flight: flight[:2]):
             paths = [path for *_, path in group]
             sets = [(chosen, '') for size in (1, 2, 3) for chosen in combinations(paths, size)]
             sets += [((path,), name) for path in paths for name in robots if name.startswith(
                 vehicle) and not name.endswith(path.name)]
-            for chosen, name in sets:
-                rows.append(weighed(vehicle, cause, chosen, robots[name], name))
+            rows += [weighed(vehicle, cause, chosen, robots[name], name) for chosen, name in sets]
     return rows
 
 
@@ -101,7 +121,6 @@ def centred(path, to):
     own = [found.index[name] for name in ('centre_of_mass.offset[0]', 'centre_of_mass.offset[1]',
                                           'rotor_hub_moment.coefficient')]
     x, y, _ = np.linalg.solve(found.info[np.ix_(own, own)], found.right[own]).tolist()
-    to = to.with_suffix('.yaml')
     to.write_text(f'extends: {ROBOT}\neffects:\n  voltage_sag: {{exponent: 1.0}}\n'
                   f'  centre_of_mass: {{offset: [{x}, {y}, 0.0]}}\n')
     return to
@@ -113,15 +132,10 @@ def weighed(vehicle, cause, paths, robot, reference):
     effects, right = result['effects'], holding(cause)
     score = 'undecided' if not effects else 'right' if all(
         set(effect['members']) & right for effect in effects) else 'wrong'
-    sizes = ['/'.join(e['members']) + ' ' + ', '.join(
-        f"{p['value']:.2f} [{p['interval'][0]:.2f}, {p['interval'][1]:.2f}]"
-        for p in e['parameters'].values() if not isinstance(p['value'], list)) for e in effects]
-    row = {'vehicle': vehicle, 'cause': cause, 'flights': [path.name for path in paths],
-           'reference': reference, 'verdict': result['verdict'], 'effects': effects,
-           'false_alarm_probability': result['false_alarm_probability'], 'score': score}
-    print(f"| {cause} {vehicle[-2:]} | {len(paths)} | {reference} | {row['verdict']} | "
-          f"{'; '.join(sizes)} | {row['false_alarm_probability']:.2g} | {score} |", flush=True)
-    return row
+    print(f"| {cause} {vehicle[-2:]} | {len(paths)} | {reference} | {result['verdict']} | "
+          f"{sizes(effects)} | {result['false_alarm_probability']:.2g} | {score} |", flush=True)
+    return {'vehicle': vehicle, 'cause': cause, 'flights': [path.name for path in paths],
+            'reference': reference, 'score': score, **result}
 
 
 def main():
@@ -131,31 +145,7 @@ def main():
     parser.add_argument('--json', type=Path)
     parser.add_argument('--crazypad', action='store_true')
     given = parser.parse_args()
-    if given.crazypad:
-        print('| cause | flights | reference | verdict | effects, 95 % | probability | |')
-        print('| --- | --- | --- | --- | --- | --- | --- |')
-        rows = crazypad(given.folder)
-        if given.json:
-            given.json.write_text(json.dumps(rows, indent=1))
-        return
-    one, two = halves(given.folder)
-    print('| case | verdict | effects, 95 % | gap before | after |')
-    print('| --- | --- | --- | --- | --- |')
-    with tempfile.TemporaryDirectory() as folder:
-        corrected, rows = Path(folder, 'corrected.yaml'), []
-        bare = Path(folder, 'bare.yaml')
-        bare.write_text(f'extends: {ROBOT}\neffects: {{}}\n')
-        rows.append(analysed('literature, half 1', one, two, ROBOT, corrected))
-        rows.append(analysed('literature, half 2', two, one, ROBOT))
-        rows.append(analysed('without voltage, half 1', one, two, bare))
-        rows.append(analysed('without voltage, half 2', two, one, bare))
-        effects = yaml.safe_load(corrected.read_text())['effects']
-        for name in effects:
-            less = {other: values for other, values in effects.items() if other != name}
-            robot = Path(folder, f'without_{name}.yaml')
-            robot.write_text(yaml.safe_dump({'extends': str(ROBOT), 'effects': less}))
-            rows.append(analysed(f'corrected by half 1 without {name}, half 2', two, one, robot))
-        rows.append(analysed('corrected by half 1, half 2', two, one, corrected))
+    rows = (crazypad if given.crazypad else nanobench)(given.folder)
     if given.json:
         given.json.write_text(json.dumps(rows, indent=1))
 

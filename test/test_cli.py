@@ -108,3 +108,10 @@ def test_a_missing_library_is_named_with_its_remedy(capsys, monkeypatch, command
     monkeypatch.setitem(sys.modules, module, None)
     line = refused(capsys, *command.split())
     assert module in line and remedy in line
+
+
+@pytest.mark.parametrize(('given', 'meant'), [
+    ('a b --holdout c --json g', 'a b --holdout c --json g'),
+    ('--robot r a b --holdout c d', '--robot r a b --holdout c --holdout d')])
+def test_every_run_after_holdout_is_held_out(given, meant):
+    assert cli.spread(given.split()) == meant.split()

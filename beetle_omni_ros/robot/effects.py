@@ -344,8 +344,7 @@ CATALOGUE: dict[str, Effect] = {
     'joint_torque_limit': Effect(
         'joint', {
             # The file's 3 N m is 60 times the demand of quick poses; the real limit may be lower.
-            'effort_limit': _number('joints.effort_limit', 'N m', 0.001, 100, 0.8, 0.05,
-                                    least=1e-3)},
+            'effort_limit': _number('joints.effort_limit', 'N m', 0.001, 100, 0.8, 0.05)},
         '|tau| <= limit: current limit, stall', 'large tilt steps',
         ('joint_velocity_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
         channels='J', starts=((1.1,), (0.8,), (0.5,)), limit=('torque', 0.98)),

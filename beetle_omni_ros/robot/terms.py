@@ -82,7 +82,6 @@ class EffectParameter:
     number: str = ''        # dotted key of the robot file's number that it replaces
     sensor: str = ''        # field of SensorErrors that it sets
     tolerance: str = ''     # between robots of one type: tolerance_... of params/gap.yaml
-    least: float = 0.02     # smallest ratio to the robot file's own number in a fit
     step: float = 1e-3      # of a fit's derivatives; of the logarithm for the file's own numbers
     form: bool = False      # it only chooses a form of the effect and is not fitted
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 import csv
+import gzip
 import json
 from math import isfinite
 from pathlib import Path
@@ -14,16 +15,19 @@ LogError = ParameterError   # its name in identify
 
 
 def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expected: str, *,
-               check: Callable[[list[float]], str] = lambda values: ''
+               check: Callable[[list[float]], str] = lambda values: '', gaps: bool = False
                ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """
-    Read columns of a CSV file; blank lines, comments (#) and further columns are ignored.
+    Read columns of a CSV file, plain or compressed by gzip.
+
+    Blank lines, comments (#) and further columns are ignored.
 
     Args:
         path: path of the file.
         wanted: header -> names of the columns to read; may raise ParameterError without the path.
         expected: example of a header, for messages.
         check: values of a row -> text about an unusable row after its number, or ''.
+        gaps: whether a field may be empty or not finite; empty is NaN.
 
     Returns:
         Name -> (N,) values of the read columns, and (N,) line number of each row in the file.
@@ -34,12 +38,13 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
 
     """
     try:
-        with open(path, newline='', encoding='utf-8-sig') as file:
+        opened = gzip.open if Path(path).suffix == '.gz' else open
+        with opened(path, 'rt', newline='', encoding='utf-8-sig') as file:
             reader = csv.reader(file)
             lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except FileNotFoundError:
         raise ParameterError(f'{path}: no such file') from None
-    except (OSError, UnicodeDecodeError, csv.Error) as cause:
+    except (OSError, EOFError, UnicodeDecodeError, csv.Error) as cause:
         reason = f"not a CSV text file ({getattr(cause, 'strerror', None) or cause})"
         raise ParameterError(f'{path}: {reason}') from None
     lines = [(number, row) for number, row in lines
@@ -58,7 +63,8 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
         raise ParameterError(f'{path}: row {number}: {cause}; expected {expected}') from None
     index, values = [header.index(name) for name in names], []
     for line, row in lines:
-        reason = _unusable(row, header, index)
+        row = [cell or 'nan' for cell in row] if gaps else row
+        reason = _unusable(row, header, index, gaps)
         if not reason:
             values.append([float(row[k]) for k in index])
             reason = check(values[-1])
@@ -69,12 +75,13 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
             np.array([line for line, _ in lines], dtype=int))
 
 
-def _unusable(row, header, index):
+def _unusable(row, header, index, gaps):
     if len(row) != len(header):
         return f': expected {len(header)} values, found {len(row)}'
-    bad = next((k for k in index if not _is_number(row[k]) or not isfinite(float(row[k]))), None)
-    return '' if bad is None else \
-        f', column {header[bad]}: expected a finite number, found {quoted(row[bad])}'
+    bad = next((k for k in index if not _is_number(row[k]) or not (
+        gaps or isfinite(float(row[k])))), None)
+    return '' if bad is None else f', column {header[bad]}: expected a ' \
+        f'{"" if gaps else "finite "}number, found {quoted(row[bad])}'
 
 
 def _is_number(text):

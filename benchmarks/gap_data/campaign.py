@@ -18,45 +18,38 @@ import joblib
 from gap_data.cases import Case, load_settings
 from gap_data.flight import LostFlight
 from gap_data.judge import judge
-from gap_data.make import make_case, ROBOT_FILE
+from gap_data.make import make_case, write_json
 
 KEYS = ('verdict', 'effects', 'where', 'gap_before', 'gap_after', 'noise_floor', 'closure',
         'candidates', 'next_experiment')
+TIMEOUT = 300.0     # [s] for a case
 
 
 def run_campaign(cases: list[Case], tool: str, folder: Path, *, version: str = '',
-                 sealed: Path | None = None, robot_file: Path = ROBOT_FILE, fresh: bool = False,
-                 timeout: float = 300.0,
-                 done: Callable[[Case, dict | None], None] = lambda *_: None) -> list[dict]:
+                 done: Callable[[], None] = lambda: None) -> list[dict]:
     """
     Ask the tool about every case, in joblib's configuration of the moment.
 
     Args:
         cases: which.
         tool: command that takes `gap` and its arguments; '' makes the flights only.
-        folder: of flights and answers.
+        folder: of flights, labels and answers.
         version: of the tool's code; answers of another one are not kept for this.
-        sealed: of the labels; None is 'sealed' in ``folder``.
-        robot_file: what the tool is told.
-        fresh: ask again where an answer is kept.
-        timeout: [s] for a case.
-        done: called with what was judged, as results come in.
+        done: called after each case.
 
     Returns:
         Judged cases in the order given; lost flights are left out.
 
     """
-    sealed = sealed or folder / 'sealed'
-    place = hashlib.sha256((tool + version).encode()).hexdigest()[:8]
-    calls = (joblib.delayed(_one)(case, tool, folder, sealed, robot_file, timeout,
-                                  folder / 'answers' / place / f'{case.key()}.json', fresh)
+    place = folder / 'answers' / hashlib.sha256((tool + version).encode()).hexdigest()[:8]
+    calls = (joblib.delayed(_one)(case, tool, folder, place / f'{case.key()}.json')
              for case in cases)
     judged = {}
     for case, run in joblib.Parallel(return_as='generator_unordered', batch_size=1,
                                      pre_dispatch='all')(calls):
         if run:
-            judged[case.key()] = judge(open_label(case, sealed), run)
-        done(case, judged.get(case.key()))
+            judged[case.key()] = judge(open_label(case, folder / 'sealed'), run)
+        done()
     return [judged[case.key()] for case in cases if case.key() in judged]
 
 
@@ -70,31 +63,29 @@ def open_label(case: Case, sealed: Path) -> dict:
             'name_is_right': bool(hover and hover['name_is_right'])}
 
 
-def _one(case, tool, folder, sealed, robot_file, timeout, kept, fresh):
+def _one(case, tool, folder, kept):
     """Runs in a worker."""
     try:
-        flights = make_case(case, folder / 'flights', sealed, robot_file)
+        flights = make_case(case, folder / 'flights', folder / 'sealed')
     except LostFlight:
         return case, None
     if not tool:
         return case, None
-    if kept.is_file() and not fresh:
+    if kept.is_file():
         return case, json.loads(kept.read_text())
-    run = ask(tool, flights, timeout)
+    run = ask(tool, flights)
     kept.parent.mkdir(parents=True, exist_ok=True)
-    partial = kept.with_name(f'{kept.name}.{os.getpid()}')
-    partial.write_text(json.dumps(run))
-    os.replace(partial, kept)
+    write_json(kept, run)
     return case, run
 
 
-def ask(tool: str, case: Path, timeout: float) -> dict:
+def ask(tool: str, case: Path) -> dict:
     """
     Run the tool on one case, in a process of its own that is told paths and nothing else.
 
     Returns:
-        ``answer`` (the JSON, or None), ``problems`` of the JSON, ``status``, ``wall_s``,
-        ``cpu_s``, ``traceback`` (bool), ``message`` (end of standard error).
+        ``answer`` (the JSON, or None), ``problems`` of the JSON, ``wall_s``, ``cpu_s``,
+        ``traceback`` (bool), ``message`` (end of standard error).
 
     """
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
@@ -105,18 +96,17 @@ def ask(tool: str, case: Path, timeout: float) -> dict:
                  '--apply', 'robot_new.yaml', '--json', 'gap.json', '--report', 'gap.html']
         try:
             done = subprocess.run(words, cwd=folder, capture_output=True, text=True,
-                                  errors='replace', check=False, timeout=timeout,
+                                  errors='replace', check=False, timeout=TIMEOUT,
                                   env={**os.environ, 'NO_COLOR': '1'})
-            status, text, printed = done.returncode, done.stderr, done.stdout + done.stderr
+            message, printed = done.stderr, done.stdout + done.stderr
         except subprocess.TimeoutExpired:
-            status, text, printed = 124, f'not finished after {timeout:g} s', ''
+            message, printed = f'not finished after {TIMEOUT:g} s', ''
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         answer, problems = read_answer(Path(folder, 'gap.json'))
-    return {'answer': answer, 'problems': problems, 'status': status,
-            'wall_s': time.monotonic() - began,
+    return {'answer': answer, 'problems': problems, 'wall_s': time.monotonic() - began,
             'cpu_s': after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
             'traceback': 'Traceback (most recent call last)' in printed,
-            'message': text.strip()[-600:]}
+            'message': message.strip()[-200:]}
 
 
 def read_answer(path: Path) -> tuple[dict | None, list[str]]:
@@ -132,9 +122,9 @@ def read_answer(path: Path) -> tuple[dict | None, list[str]]:
     return answer, problems
 
 
-def code_key(paths: list[Path]) -> str:
-    """Of Python files below the paths: answers of other code are not the same answers."""
+def code_key(root: Path) -> str:
+    """Of Python files below a folder: answers of other code are not the same answers."""
     digest = hashlib.sha256()
-    for path in sorted(p for root in paths for p in root.rglob('*.py')):
+    for path in sorted(root.rglob('*.py')):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:8]

@@ -38,7 +38,7 @@ class PoseController:
 
     def __init__(self, robot: Robot, rng: np.random.Generator, lively: bool):
         self.gains = Gains(rng)
-        nominal = robot.nominal(robot.numbers)
+        nominal = Robot()
         self._mass, self._inertia = nominal.mass, nominal.inertia
         self._gravity = robot.numbers['robot']['gravity']
         self._most, self._limit = nominal.thrust_max, nominal.position_limit - 0.06

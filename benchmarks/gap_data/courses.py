@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, RotationSpline
 
-KINDS = ('poses', 'hover', 'slow', 'lemniscate', 'rest')
 RATE = 100.0  # [Hz] of the tables
 
 
@@ -19,7 +18,6 @@ class Course:
     Attributes:
         position, velocity, acceleration: (N, 3) in world.
         rotation: (N, 3, 3) body to world; rate (N, 3) in the reference's own axes.
-        targets: (time [s], position, quaternion x y z w) at which a new pose is asked for.
 
     """
 
@@ -28,7 +26,6 @@ class Course:
     acceleration: np.ndarray
     rotation: np.ndarray
     rate: np.ndarray
-    targets: list
 
 
 def make_course(kind: str, duration: float, rng: np.random.Generator,
@@ -37,28 +34,18 @@ def make_course(kind: str, duration: float, rng: np.random.Generator,
     Draw a course.
 
     Args:
-        kind: 'poses' (changes of pose with low passes and strong rotation), 'hover' (one pose),
-            'slow' (drifting by decimetres and a few degrees), 'lemniscate', 'rest' (on a stand).
+        kind: 'poses' (changes of pose with low passes and strong rotation), 'hover' (one pose) or
+            'lemniscate'.
         duration: [s].
         rng: of this flight.
         vigour: 1 is normal, less is calmer.
 
     """
-    if kind not in KINDS:
-        raise ValueError(f"course '{kind}': expected one of {', '.join(KINDS)}")
     times = np.arange(0.0, duration + 1.0, 1 / RATE)
     if kind == 'poses':
         knots, position, angles = _pose_table(duration, rng, vigour)
-        table = _eased(times, knots, position), _eased_rotations(times, knots, angles)
-        targets = [(t, p, Rotation.from_euler('ZYX', a).as_quat())
-                   for t, p, a in zip(knots[1::2], position[1::2], angles[1::2])]
-    elif kind == 'lemniscate':
-        table, targets = _lemniscate(times, duration, rng), []
-    else:
-        size = 0.0 if kind != 'slow' else 1.0
-        table = _drift(times, rng, size, 0.0 if kind == 'rest' else 1.0)
-        targets = [(0.0, table[0][0], table[1][0].as_quat())]
-    return _differentiate(*table, targets)
+        return _course(_eased(times, knots, position), _eased_rotations(times, knots, angles))
+    return _course(*(_lemniscate if kind == 'lemniscate' else _hover)(times, rng))
 
 
 def _pose_table(duration, rng, vigour):
@@ -105,7 +92,7 @@ def _eased_rotations(times, knots, angles):
     return poses[k] * Rotation.from_rotvec(way[k] * s[:, None])
 
 
-def _lemniscate(times, duration, rng):
+def _lemniscate(times, rng):
     """A figure of eight in three dimensions, with roll and pitch; fades in over 3 s."""
     period = rng.uniform(8.0, 11.0)
     rise = np.clip(times / 3.0, 0, 1)
@@ -118,20 +105,14 @@ def _lemniscate(times, duration, rng):
     return position, Rotation.from_euler('ZYX', angles)
 
 
-def _drift(times, rng, size, height):
-    """Hover, or a wander of decimetres and degrees with periods of 8 to 20 s."""
-    def wander(width):
-        periods, phases = rng.uniform(8, 20, (2, 3)), rng.uniform(0, 2 * np.pi, (2, 3))
-        waves = np.sin(2 * np.pi * times[:, None, None] / periods + phases)
-        return size * width * (waves - waves[0]).sum(axis=1)
-
-    start = np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(0.9, 1.4)]) * height
-    yaw = rng.uniform(-np.pi, np.pi) * height
-    angles = np.array([yaw, 0, 0]) + wander(np.array([0.1, 0.04, 0.04]))
-    return start + wander(np.array([0.15, 0.15, 0.08])), Rotation.from_euler('ZYX', angles)
+def _hover(times, rng):
+    place = np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(0.9, 1.4)])
+    turn = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
+    ones = np.ones((len(times), 1))
+    return place * ones, Rotation.from_rotvec(turn * ones)
 
 
-def _differentiate(position, rotation, targets):
+def _course(position, rotation):
     step = 1 / RATE
     velocity = np.gradient(position, step, axis=0)
     acceleration = np.gradient(velocity, step, axis=0)
@@ -141,4 +122,4 @@ def _differentiate(position, rotation, targets):
     last = (len(times) - 1) // every * every
     spline = RotationSpline(times[:last + 1:every], rotation[:last + 1:every])
     rate = spline(np.minimum(times, times[last]), 1)
-    return Course(position, velocity, acceleration, rotation.as_matrix(), rate, targets)
+    return Course(position, velocity, acceleration, rotation.as_matrix(), rate)

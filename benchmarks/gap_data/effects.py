@@ -10,6 +10,7 @@ the interface defines the parameter.
 from __future__ import annotations
 
 from collections.abc import Callable
+from inspect import isfunction
 
 import numpy as np
 
@@ -31,26 +32,15 @@ SHAPES: dict[str, tuple[str, ...]] = {
     'joint_backlash': ('sprung',), 'joint_deflection': ('hardening',),
     'imu_filter_lag': ('butterworth',)}
 
-_BODY = ('mass', 'centre_of_mass', 'inertia', 'thrust_coefficient', 'rotor_thrust_coefficient',
-         'torque_coefficient', 'ground_effect', 'rotor_drag', 'body_drag', 'axial_inflow',
-         'translational_lift', 'tilt_thrust_loss', 'wind', 'propeller_gyroscopic_torque',
-         'rotor_acceleration_torque', 'module_reaction')
-_ACTUATORS = ('voltage_sag', 'rotor_lag', 'rotor_dead_time', 'thrust_saturation',
-              'command_latency', 'joint_command_latency', 'joint_bandwidth',
-              'joint_velocity_limit', 'joint_torque_limit', 'joint_friction', 'joint_backlash',
-              'joint_deflection', 'joint_offset')
-_SENSORS = ('mocap_time_offset', 'imu_filter_lag', 'joint_feedback_delay',
-            'imu_accelerometer_bias', 'imu_gyroscope_bias', 'imu_misalignment', 'imu_lever_arm',
-            'mocap_misalignment')
-_OUTSIDE = ('vibration', 'force_field', 'slosh', 'wake', 'fade', 'cable', 'flutter')
-
 Build = Callable[[Robot, Hidden, float, str, np.random.Generator], dict]
-CATALOGUE: dict[str, Build] = {
-    **{name: getattr(body, name) for name in _BODY},
-    **{name: getattr(actuators, name) for name in _ACTUATORS},
-    **{name: getattr(sensors, name) for name in _SENSORS}}
-OUTSIDE: dict[str, Build] = {name: getattr(outside, name) for name in _OUTSIDE}
 
+
+def _effects(*modules) -> dict[str, Build]:
+    return {name: build for module in modules for name, build in vars(module).items()
+            if isfunction(build) and build.__module__ == module.__name__ and name[0] != '_'}
+
+
+CATALOGUE, OUTSIDE = _effects(body, actuators, sensors), _effects(outside)
 # A true effect whose companion is part of the same physics: naming it too is not wrong.
 COMPANIONS = {'propeller_gyroscopic_torque': ('rotor_acceleration_torque',),
               'rotor_acceleration_torque': ('propeller_gyroscopic_torque',)}

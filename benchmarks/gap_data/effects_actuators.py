@@ -1,4 +1,4 @@
-"""Hidden effects of rotors, servos and command timing; see :mod:`gap_data.effects`."""
+"""Hidden effects of rotors and servos; see :mod:`gap_data.effects`."""
 
 from __future__ import annotations
 
@@ -48,30 +48,11 @@ def rotor_lag(robot, hidden, size, shape, rng):
     return {'time_constant': float(np.mean(robot.time_constant))}
 
 
-def rotor_dead_time(robot, hidden, size, shape, rng):
-    """Thrust commands take hold ``size`` [s] later."""
-    hidden.thrust_delay += size
-    return {'delay': size}
-
-
 def thrust_saturation(robot, hidden, size, shape, rng):
     """Rotors give at most 15 N - ``size``; plain: a corner; soft: rounded over 0.4 N."""
     hidden.thrust_ceiling = 15.0 - size
     hidden.ceiling_softness = 0.4 if shape == 'soft' else 0.0
     return {'thrust_max': 15.0 - size}
-
-
-def command_latency(robot, hidden, size, shape, rng):
-    """All commands take hold ``size`` [s] later."""
-    hidden.thrust_delay += size
-    hidden.tilt_delay += size
-    return {'delay': size}
-
-
-def joint_command_latency(robot, hidden, size, shape, rng):
-    """Tilt commands take hold ``size`` [s] later."""
-    hidden.tilt_delay += size
-    return {'delay': size}
 
 
 def joint_bandwidth(robot, hidden, size, shape, rng):

@@ -6,19 +6,12 @@ from math import cos, exp, pi, radians, sin, sqrt, tanh
 
 import numpy as np
 
-from gap_data.hidden import Hidden
+from gap_data.hidden import direction, Hidden, NOTHING
 from gap_data.mjcf import main_body
 from gap_data.truth import Robot
 
-NOTHING = (0.0, 0.0, 0.0)
 DRAWS = 1000      # of an inertia, until a body can have it ...
 ROOM = 0.95       # ... with room for tolerances of 3 %
-
-
-def direction(rng: np.random.Generator) -> np.ndarray:
-    """A unit vector, uniform on the sphere."""
-    vector = rng.standard_normal(3)
-    return vector / np.linalg.norm(vector)
 
 
 def mass(robot: Robot, hidden: Hidden, size, shape, rng):

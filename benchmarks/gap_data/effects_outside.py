@@ -6,7 +6,7 @@ from math import cos, exp, pi, sin, sqrt, tanh
 
 import numpy as np
 
-from gap_data.effects_body import direction, NOTHING
+from gap_data.hidden import direction, NOTHING
 
 
 def vibration(robot, hidden, size, shape, rng):

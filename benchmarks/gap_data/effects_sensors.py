@@ -1,53 +1,35 @@
-"""Hidden effects of clocks and sensors; see :mod:`gap_data.effects`."""
+"""Hidden effects of clocks, sensors and delays of commands; see :mod:`gap_data.effects`."""
 
 from __future__ import annotations
 
-from gap_data.effects_body import direction
+from gap_data.hidden import direction
 
 
-def joint_feedback_delay(robot, hidden, size, shape, rng):
-    """Encoder readings are ``size`` [s] older than their stamps."""
-    hidden.joint_feedback_delay += size
-    return {'delay': size}
+def _late(*clocks):
+    """Readings are older than their stamps, or commands take hold later, by ``size`` [s]."""
+    def build(robot, hidden, size, shape, rng):
+        for clock in clocks:
+            setattr(hidden, clock, getattr(hidden, clock) + size)
+        return {'delay': size}
+    return build
 
 
-def mocap_time_offset(robot, hidden, size, shape, rng):
-    """MoCap poses are ``size`` [s] older than their stamps."""
-    hidden.mocap_delay += size
-    return {'delay': size}
+def _vector(field, parameter):
+    """A vector of the length ``size`` in some direction of the sensor or the body."""
+    def build(robot, hidden, size, shape, rng):
+        setattr(hidden, field, getattr(hidden, field) + size * direction(rng))
+        return {parameter: getattr(hidden, field)}
+    return build
 
 
-def imu_filter_lag(robot, hidden, size, shape, rng):
-    """The IMU's output went through a second-order low-pass with ``size`` [s] of group delay."""
-    hidden.imu_delay += size
-    return {'delay': size}
-
-
-def imu_accelerometer_bias(robot, hidden, size, shape, rng):
-    """Offset of ``size`` [m/s^2] in some direction of the sensor."""
-    hidden.accelerometer_bias = hidden.accelerometer_bias + size * direction(rng)
-    return {'bias': hidden.accelerometer_bias}
-
-
-def imu_gyroscope_bias(robot, hidden, size, shape, rng):
-    """Offset of ``size`` [rad/s] in some direction of the sensor."""
-    hidden.gyroscope_bias = hidden.gyroscope_bias + size * direction(rng)
-    return {'bias': hidden.gyroscope_bias}
-
-
-def imu_misalignment(robot, hidden, size, shape, rng):
-    """The IMU is mounted ``size`` [rad] askew."""
-    hidden.imu_rotation = hidden.imu_rotation + size * direction(rng)
-    return {'rotation': hidden.imu_rotation}
-
-
-def imu_lever_arm(robot, hidden, size, shape, rng):
-    """The IMU sits ``size`` [m] from base_link's origin."""
-    hidden.imu_position = hidden.imu_position + size * direction(rng)
-    return {'lever_arm': hidden.imu_position}
-
-
-def mocap_misalignment(robot, hidden, size, shape, rng):
-    """The MoCap body's axes stand ``size`` [rad] askew on base_link."""
-    hidden.mocap_rotation = hidden.mocap_rotation + size * direction(rng)
-    return {'rotation': hidden.mocap_rotation}
+joint_feedback_delay = _late('joint_feedback_delay')
+mocap_time_offset = _late('mocap_delay')
+imu_filter_lag = _late('imu_delay')     # group delay of a low-pass of second order
+command_latency = _late('thrust_delay', 'tilt_delay')
+joint_command_latency = _late('tilt_delay')
+rotor_dead_time = _late('thrust_delay')
+imu_accelerometer_bias = _vector('accelerometer_bias', 'bias')      # [m/s^2]
+imu_gyroscope_bias = _vector('gyroscope_bias', 'bias')              # [rad/s]
+imu_misalignment = _vector('imu_rotation', 'rotation')              # [rad]
+imu_lever_arm = _vector('imu_position', 'lever_arm')                # [m] from base_link
+mocap_misalignment = _vector('mocap_rotation', 'rotation')          # [rad]

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from gap_data.controller import PoseController
 from gap_data.courses import Course, make_course, RATE
-from gap_data.gusts import draw_gust
 from gap_data.hidden import Hidden
 from gap_data.plant import Plant
 from gap_data.truth import Robot
@@ -48,7 +48,7 @@ class Truth:
 
 
 def fly(robot: Robot, hidden: Hidden, *, kind: str, duration: float, seed: int,
-        multibody: bool, gust: bool, conditions: str, command_age: float) -> Truth:
+        multibody: bool, gust: bool, conditions: str) -> Truth:
     """
     Fly one course; a lost flight is tried again, calmer.
 
@@ -61,7 +61,6 @@ def fly(robot: Robot, hidden: Hidden, *, kind: str, duration: float, seed: int,
         multibody: which description of the robot.
         gust: whether a coloured wrench pushes.
         conditions: 'nominal' or 'published' latencies of the controller's state.
-        command_age: [s] from a command's stamp until the actuators execute it.
 
     Raises:
         LostFlight: lost at every attempt.
@@ -72,14 +71,13 @@ def fly(robot: Robot, hidden: Hidden, *, kind: str, duration: float, seed: int,
         course = make_course(kind, duration, rng, vigour=0.8 ** attempt)
         try:
             return _attempt(robot, hidden, kind, course, duration, rng, multibody, gust,
-                            conditions, command_age)
+                            conditions)
         except LostFlight as error:
             reason = error
     raise LostFlight(f'{kind} flight, seed {seed}: {reason}')
 
 
-def _attempt(robot, hidden, kind, course, duration, rng, multibody, gust, conditions,
-             command_age):
+def _attempt(robot, hidden, kind, course, duration, rng, multibody, gust, conditions):
     numbers = robot.numbers
     lively = kind in ('poses', 'lemniscate')
     controller = PoseController(robot, rng, lively)
@@ -88,7 +86,7 @@ def _attempt(robot, hidden, kind, course, duration, rng, multibody, gust, condit
     charge = rng.uniform(*numbers['battery']['charge'])
     plant = Plant(robot, hidden, multibody=multibody, position=course.position[0],
                   quaternion=_wxyz(course.rotation[0]), tilt=tilt, thrust=thrust,
-                  charge=charge, command_age=command_age)
+                  charge=charge, command_age=numbers['command_age'])
     step = plant.step_length
     force, torque = (draw_gust(numbers['gust'], duration, step, rng) if gust else (None, None))
     sight = Sight(numbers, conditions, rng, step)
@@ -114,6 +112,29 @@ def _attempt(robot, hidden, kind, course, duration, rng, multibody, gust, condit
     commands = np.array(commands)
     return Truth(np.arange(count) * step, _split(log), commands[:, 0], commands[:, 1:5],
                  commands[:, 5:9], course)
+
+
+def draw_gust(settings: dict, duration: float, step: float,
+              rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Force in world and torque in base_link, (N, 3) each, one row a step.
+
+    A second-order (Dryden-like) colouring: white noise through two equal lags.
+    """
+    count = int(round(duration / step)) + 1
+    return (_coloured(count, step, rng.uniform(*settings['time']),
+                      rng.uniform(*settings['force']), rng),
+            _coloured(count, step, rng.uniform(*settings['time']),
+                      rng.uniform(*settings['torque']), rng))
+
+
+def _coloured(count, step, time, rms, rng):
+    pole = np.exp(-step / (0.5 * time))
+    white = rng.standard_normal((count + 4000, 3))
+    wave = lfilter([1.0], [1.0, -2 * pole, pole * pole], white, axis=0)[4000:]
+    # the filter's stationary deviation, not the sample's, so that seeds differ in strength
+    gain = np.sqrt((1 + pole ** 2) / (1 - pole ** 2) ** 3)
+    return rms / gain * wave
 
 
 class Sight:

@@ -12,6 +12,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+NOTHING = (0.0, 0.0, 0.0)
+
+
+def direction(rng: np.random.Generator) -> np.ndarray:
+    """A unit vector, uniform on the sphere."""
+    vector = rng.standard_normal(3)
+    return vector / np.linalg.norm(vector)
+
 
 class Snapshot:
     """

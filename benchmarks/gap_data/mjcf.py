@@ -68,7 +68,7 @@ def model_xml(robot: Robot, *, multibody: bool, imu_position=(0.0, 0.0, 0.0),
       <site name="base"/><site name="imu" pos="{_vector(imu_position)}"/>{inside}{loose}</body>
     {outside}</worldbody>
   <actuator>{base}{servos}</actuator>
-  <sensor><accelerometer site="imu"/><gyro site="imu"/></sensor>
+  <sensor><accelerometer site="imu"/></sensor>
 </mujoco>"""
 
 

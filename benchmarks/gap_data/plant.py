@@ -22,13 +22,13 @@ class Plant:
     Attributes:
         time: [s] since the flight began.
         snapshot: state at the start of the last step.
-        specific_force, angular_velocity: (3,) of the IMU's place, body axes, at that start.
+        specific_force: (3,) of the IMU's place, body axes, at that start.
 
     """
 
     def __init__(self, robot: Robot, hidden: Hidden, *, multibody: bool, position, quaternion,
                  tilt, thrust, charge: float = 0.9, command_age: float = 0.0,
-                 velocity=ZERO3, rate=ZERO3):
+                 rate=ZERO3):
         """
         Put the robot into the air.
 
@@ -42,7 +42,6 @@ class Plant:
             thrust: (4,) [N] at the start.
             charge: of the pack, 0 to 1.
             command_age: [s] from a command's stamp until it acts.
-            velocity: (3,) [m/s] in world.
             rate: (3,) [rad/s] in base_link.
 
         """
@@ -58,7 +57,7 @@ class Plant:
         self._v = [int(self.model.jnt_dofadr[j]) for j in joints]
         self._body = name(self.model, mujoco.mjtObj.mjOBJ_BODY, 'base_link')
         self.data.qpos[:7] = [*position, *quaternion]
-        self.data.qvel[:6] = [*velocity, *rate]
+        self.data.qvel[3:6] = rate
         self.data.qpos[self._q] = tilt
         self.tilts = DelayLine(command_age + hidden.tilt_delay, [float(q) for q in tilt])
         self.thrusts = DelayLine(command_age + hidden.thrust_delay, [float(f) for f in thrust])
@@ -76,7 +75,7 @@ class Plant:
         self._count = 0
         self.time = 0.0
         self.snapshot = Snapshot()
-        self.specific_force = self.angular_velocity = None
+        self.specific_force = None
 
     def command(self, stamp: float, tilt, thrust) -> None:
         """Send tilts (4,) [rad] and thrusts (4,) [N]."""
@@ -112,8 +111,7 @@ class Plant:
         data.ctrl[:] = wrench + targets
         self._servos(s, joint)
         mujoco.mj_step(self.model, data)
-        sensors = data.sensordata
-        self.specific_force, self.angular_velocity = sensors[0:3], sensors[3:6]
+        self.specific_force = data.sensordata[:3]
         self._count += 1
         self.time = self._count * self.step_length
         return s

@@ -1,48 +1,53 @@
-"""All answers as numbers: the issue's criteria, with their intervals."""
+"""All answers as numbers with the interval in which they lie with 95 %, and as a page."""
 
 from __future__ import annotations
 
+import numpy as np
+from scipy.stats import binomtest
+
 from gap_data.cases import DIFFICULTIES
-from gap_data.intervals import median, share
 
-DELAY_LIMIT = 0.003  # [s]
+NOTHING = {'value': None, 'interval': None, 'count': 0}
 
 
-def score(judged: list[dict]) -> dict:
-    """
-    Criteria by difficulty, and power.
+def share(hits: list[bool]) -> dict:
+    """Proportion with Wilson's interval; None without any case."""
+    if not hits:
+        return NOTHING
+    found = binomtest(sum(map(bool, hits)), len(hits))
+    return {'value': found.statistic, 'count': len(hits),
+            'interval': list(found.proportion_ci(method='wilson'))}
 
-    Args:
-        judged: of :func:`gap_data.judge.judge`, one for each case.
 
-    """
-    return {'criteria': {d: criteria([j for j in judged if j['difficulty'] == d], d)
-                         for d in DIFFICULTIES},
-            'power': power(judged)}
+def median(values: list[float | None], draws: int = 1000) -> dict:
+    """Median with a bootstrap interval (percentiles)."""
+    numbers = np.array([v for v in values if v is not None])
+    if not len(numbers):
+        return NOTHING
+    rng = np.random.default_rng(0)
+    medians = np.median(rng.choice(numbers, (draws, len(numbers))), axis=1)
+    return {'value': float(np.median(numbers)), 'count': len(numbers),
+            'interval': np.percentile(medians, [2.5, 97.5]).tolist()}
+
+
+def score(judged: list[dict]) -> dict[str, list[dict]]:
+    """Criteria by difficulty, of cases judged by :func:`gap_data.judge.judge`."""
+    return {d: criteria([j for j in judged if j['difficulty'] == d], d) for d in DIFFICULTIES}
 
 
 def criteria(judged: list[dict], difficulty: str) -> list[dict]:
     """Each with name, value, interval, count, target and whether the value reaches it."""
     clean = difficulty == 'clean'
-    of = {kind: [j for j in judged if j['kind'] == kind]
-          for kind in {j['kind'] for j in judged}}
-    singles, pairs, none = of.get('singles', []), of.get('pairs', []), of.get('none', [])
-    outside, hover = of.get('outside', []), of.get('undecidable', [])
-    broken = of.get('short', []) + of.get('damaged', [])
+    singles, none, pairs, outside, hover = ([j for j in judged if j['kind'] == kind] for kind in (
+        'singles', 'none', 'pairs', 'outside', 'undecidable'))
     rows = [row for j in singles + pairs for row in j['parameters']]
-    known = [r for r in rows if not r['missing']]
-    sized = [r for r in known if not r['delay']]
-    delays = [r for r in known if r['delay']]
-    flown = [j for j in judged if j['kind'] in ('singles', 'none', 'pairs', 'outside')]
     table = [
         ('single: named, or the right set', share([j['right'] for j in singles]),
          '>=', 0.97 if clean else 0.90),
-        ('single: named exactly', share([all(j['exact']) for j in singles]), '>=', 0.80),
         ('single: any wrong name', share([bool(j['wrong']) for j in singles]), '<=', 0.05),
         ('none: false alarm', share([bool(j['wrong']) for j in none]), '<=', 0.05),
         ('none: says so', share([j['right'] for j in none]), '>=', 0.95),
         ('pair: both named', share([all(j['named']) for j in pairs]), '>=', 0.60),
-        ('pair: at least one named', share([any(j['named']) for j in pairs]), '>=', 0.90),
         ('pair: any wrong name', share([bool(j['wrong']) for j in pairs]), '<=', 0.10),
         ('outside the catalogue: unknown', share([j['right'] for j in outside]), '>=', 0.80),
         ('outside the catalogue: wrong name', share([bool(j['wrong']) for j in outside]),
@@ -50,42 +55,25 @@ def criteria(judged: list[dict], difficulty: str) -> list[dict]:
         ('undecidable: says so', share([j['right'] for j in hover]), '>=', 0.90),
         ('undecidable: names the experiment', share([j['next_experiment'] for j in hover]),
          '>=', 0.90),
-        ('short or damaged: honest, no wrong name', share([j['right'] for j in broken]),
-         '>=', 0.95),
         ('no traceback, no missing answer', share([not j['crashed'] for j in judged]), '>=', 1.0),
-        ('parameter error, of the effect', median([r['of_effect'] for r in sized]), '<=',
-         0.03 if clean else 0.10),
-        ('parameter error, of the value', median([r['of_value'] for r in sized]), '<=', None),
-        ('delay error [s]', median([r['error'] for r in delays]), '<=', DELAY_LIMIT),
-        ('delays within 3 ms', share([r['error'] <= DELAY_LIMIT for r in delays]), '>=', 0.9),
-        ('interval covers the truth', share([i for r in known for i in r['inside']]), 'in',
+        ('JSON as the interface says', share([not j['problems'] for j in judged]), '>=', 1.0),
+        ('parameter error, of the effect',
+         median([r['of_effect'] for r in rows if not r['delay']]), '<=', 0.03 if clean else 0.10),
+        ('delay error [s]', median([r['error'] for r in rows if r['delay']]), '<=', 0.003),
+        ('interval covers the truth', share([i for r in rows for i in r['inside']]), 'in',
          [0.90, 0.98]),
-        ('parameter reported', share([not r['missing'] for r in rows]), '>=', 1.0),
-        ('closure, single', median([_closure(j) for j in singles]), '>=', 0.8),
-        ('closure, pair', median([_closure(j) for j in pairs]), '>=', 0.6),
-        ('held-out gap worse by over 5 %', share([_worse(j) for j in flown]), '<=', 0.0),
-        ('wall time of a case [s]', median([j['wall_s'] for j in flown]), '<=', 30.0),
-        ('CPU time of a case [s]', median([j['cpu_s'] for j in flown]), '<=', None),
-        ('longest case [s]', _largest([j['wall_s'] for j in flown]), '<=', 30.0),
-        ('JSON as the interface says', share([not j['problems'] for j in judged
-                                              if j['verdict'] != 'refused']), '>=', 1.0)]
+        ('closure, single', median([j['closure'] or 0.0 for j in singles]), '>=', 0.8),
+        ('closure, pair', median([j['closure'] or 0.0 for j in pairs]), '>=', 0.6),
+        ('held-out gap worse by over 5 %', share([_worse(j) for j in judged]), '<=', 0.0),
+        ('wall time of a case [s]', median([j['wall_s'] for j in judged]), '<=', 30.0),
+        ('CPU time of a case [s]', median([j['cpu_s'] for j in judged]), '<=', None)]
     return [{'name': name, **number, 'relation': relation, 'target': target,
              'reached': _reached(number['value'], relation, target)}
             for name, number, relation, target in table]
 
 
-def _closure(j):
-    return 0.0 if j['closure'] is None else j['closure']
-
-
 def _worse(j):
-    if j['gap_before'] is None or j['gap_after'] is None:
-        return False
-    return j['gap_after'] > 1.05 * j['gap_before']
-
-
-def _largest(values):
-    return {'value': max(values) if values else None, 'interval': None, 'count': len(values)}
+    return j['gap_before'] is not None and j['gap_after'] > 1.05 * j['gap_before']
 
 
 def _reached(value, relation, target):
@@ -96,13 +84,30 @@ def _reached(value, relation, target):
     return value >= target if relation == '>=' else value <= target
 
 
-def power(judged: list[dict]) -> list[dict]:
-    """Share named by multiple of the detection limit, over effects; wrong names beside."""
-    multiples = sorted({j['multiple'] for j in judged if j['kind'] == 'power'})
-    rows = []
-    for multiple in multiples:
-        chosen = [j for j in judged if j['kind'] == 'power' and j['multiple'] == multiple]
-        rows.append({'multiple': multiple, 'named': share([j['right'] for j in chosen]),
-                     'wrong': share([bool(j['wrong']) for j in chosen]),
-                     'effects': {j['truth'][0]: j['right'] for j in chosen}})
-    return rows
+def markdown(report: dict) -> str:
+    """The criteria as a page."""
+    lines = ['# Blind campaign', '', f'{report["meta"]["cases"]} cases: '
+             f'`{report["meta"]["command"]}`', '']
+    for difficulty, rows in report['criteria'].items():
+        if any(row['count'] for row in rows):
+            lines += [f'## {difficulty.capitalize()} flights', '', '| | target | |',
+                      '|---|---|---|', *(f'| {row["name"]} | {_target(row)} | {_number(row)} |'
+                                         for row in rows), '']
+    lines += ['`**` misses its target; in brackets the 95 % interval, in parentheses the number '
+              'of cases or values.']
+    return '\n'.join(lines) + '\n'
+
+
+def _number(row):
+    if row['value'] is None:
+        return '-'
+    low, high = row['interval']
+    return f'{row["value"]:.3g} [{low:.2g}, {high:.2g}] ({row["count"]})' + (
+        ' **' if row['reached'] is False else '')
+
+
+def _target(row):
+    if row['target'] is None:
+        return ''
+    return '{:g} to {:g}'.format(*row['target']) if row['relation'] == 'in' \
+        else f'{row["relation"]} {row["target"]:g}'

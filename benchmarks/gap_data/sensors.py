@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.signal import bessel, butter, lfilter, lfilter_zi
 from scipy.spatial.transform import Rotation
@@ -12,33 +10,8 @@ from gap_data.flight import Truth
 from gap_data.hidden import Hidden
 
 
-@dataclass
-class Recording:
-    """
-    Everything that a bag of one flight holds; times in seconds since the flight began.
-
-    Attributes:
-        imu: (N, 7) stamp, specific force (3), angular rate (3).
-        mocap: (N, 8) stamp, position (3), quaternion x y z w.
-        joints: (N, 9) stamp, position (4), velocity (4).
-        battery: (N, 3) stamp, voltage, current (negative when discharging).
-        commands: (N, 9) stamp, tilt (4), thrust (4).
-        targets: (stamp, position, quaternion x y z w) of new target poses.
-        ages: seconds from stamp to arrival by the names above.
-
-    """
-
-    imu: np.ndarray
-    mocap: np.ndarray
-    joints: np.ndarray
-    battery: np.ndarray
-    commands: np.ndarray
-    targets: list
-    ages: dict[str, float]
-
-
 def measure(truth: Truth, hidden: Hidden, numbers: dict, rng: np.random.Generator, *,
-            noise: dict[str, float], shape: str = 'plain') -> Recording:
+            noise: dict[str, float], shape: str = 'plain') -> dict[str, np.ndarray]:
     """
     Sample one flight.
 
@@ -50,15 +23,20 @@ def measure(truth: Truth, hidden: Hidden, numbers: dict, rng: np.random.Generato
         noise: standard deviations: accelerometer, gyroscope, position, orientation, tilt.
         shape: of the IMU's filter: 'plain' Bessel, 'butterworth'.
 
+    Returns:
+        Tables with the stamp [s] since the flight began in the first column: ``imu`` specific
+        force and rate, ``mocap`` position and quaternion x y z w, ``joints`` positions,
+        ``battery`` voltage and current (negative when discharging), ``commands`` tilts and
+        thrusts.
+
     """
     settings = numbers['sensors']
-    commands = np.column_stack([truth.command_t, truth.command_tilt, truth.command_thrust])
-    return Recording(
-        _imu(truth, hidden, settings, rng, noise, shape),
-        _mocap(truth, hidden, settings, rng, noise),
-        _joints(truth, hidden, settings, rng, noise), _battery(truth, numbers['battery'], rng),
-        commands, truth.course.targets,
-        {'imu': 0.001, 'mocap': 0.010, 'joints': 0.010, 'battery': 0.002, 'commands': 0.001})
+    return {
+        'imu': _imu(truth, hidden, settings, rng, noise, shape),
+        'mocap': _mocap(truth, hidden, settings, rng, noise),
+        'joints': _joints(truth, hidden, settings, rng, noise),
+        'battery': _battery(truth, numbers['battery'], rng),
+        'commands': np.column_stack([truth.command_t, truth.command_tilt, truth.command_thrust])}
 
 
 def _rows(truth, period):
@@ -122,9 +100,7 @@ def _joints(truth, hidden, settings, rng, noise):
     count = 2 * np.pi / settings['counts_per_turn']
     tilt = truth.columns['tilt'][seen]
     tilt = tilt + noise['tilt'] * rng.standard_normal(tilt.shape)
-    rate = truth.columns['tilt_rate'][seen]
-    step = settings['velocity_count']
-    return np.column_stack([stamps, np.round(tilt / count) * count, np.round(rate / step) * step])
+    return np.column_stack([stamps, np.round(tilt / count) * count])
 
 
 def _battery(truth, settings, rng):

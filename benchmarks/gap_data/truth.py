@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import cos, radians, sin
 from pathlib import Path
 
@@ -10,20 +9,19 @@ import numpy as np
 import yaml
 
 HERE = Path(__file__).parent
-GROUPS = ('body', 'rotors', 'lags')
 
 
-def load_numbers(path: str | Path = HERE / 'numbers.yaml') -> dict:
+def load_numbers() -> dict:
     """Everything that stands in ``numbers.yaml``."""
-    return yaml.safe_load(Path(path).read_text())
+    return yaml.safe_load((HERE / 'numbers.yaml').read_text())
 
 
-@dataclass
 class Robot:
     """
-    The true robot; arrays may be changed by a hidden effect.
+    The true robot, at first as the interface describes it; arrays may be changed by an effect.
 
     Attributes:
+        numbers: the whole file, for what no effect changes.
         mass: [kg].
         inertia: (3,) [kg m^2] about the centre of gravity.
         centre: (3,) [m] centre of gravity in base_link, with all tilts at zero.
@@ -37,43 +35,22 @@ class Robot:
         kp, kd: (4,) [N m/rad], [N m s/rad] of the servos.
         velocity_limit, effort_limit, position_limit: of the servos [rad/s], [N m], [rad].
         joint_inertia: [kg m^2].
-        numbers: the whole file, for what no effect changes.
 
     """
 
-    mass: float
-    inertia: np.ndarray
-    centre: np.ndarray
-    positions: np.ndarray
-    arms: np.ndarray
-    spin: np.ndarray
-    ratio: float
-    thrust_scale: np.ndarray
-    time_constant: np.ndarray
-    thrust_max: float
-    kp: np.ndarray
-    kd: np.ndarray
-    velocity_limit: np.ndarray
-    effort_limit: np.ndarray
-    position_limit: float
-    joint_inertia: float
-    numbers: dict
-
-    @classmethod
-    def nominal(cls, numbers: dict | None = None) -> Robot:
-        """As the interface describes it."""
-        numbers = numbers or load_numbers()
-        r = numbers['robot']
-        return cls(
-            mass=r['mass'], inertia=np.array(r['inertia']), centre=np.zeros(3),
-            positions=np.array(r['rotor_positions']),
-            arms=np.array([[cos(radians(a)), sin(radians(a))] for a in r['arm_yaw_deg']]),
-            spin=np.array(r['spin'], float), ratio=r['torque_to_thrust_ratio'],
-            thrust_scale=np.ones(4), time_constant=np.full(4, r['rotor_time_constant']),
-            thrust_max=r['thrust_max'], kp=np.full(4, r['kp']), kd=np.full(4, r['kd']),
-            velocity_limit=np.full(4, r['velocity_limit']),
-            effort_limit=np.full(4, r['effort_limit']), position_limit=r['position_limit'],
-            joint_inertia=r['joint_inertia'], numbers=numbers)
+    def __init__(self):
+        self.numbers = load_numbers()
+        r = self.numbers['robot']
+        self.mass, self.inertia, self.centre = r['mass'], np.array(r['inertia']), np.zeros(3)
+        self.positions = np.array(r['rotor_positions'])
+        self.arms = np.array([[cos(radians(a)), sin(radians(a))] for a in r['arm_yaw_deg']])
+        self.spin, self.ratio = np.array(r['spin'], float), r['torque_to_thrust_ratio']
+        self.thrust_scale, self.thrust_max = np.ones(4), r['thrust_max']
+        self.time_constant = np.full(4, r['rotor_time_constant'])
+        self.kp, self.kd = np.full(4, r['kp']), np.full(4, r['kd'])
+        self.velocity_limit = np.full(4, r['velocity_limit'])
+        self.effort_limit = np.full(4, r['effort_limit'])
+        self.position_limit, self.joint_inertia = r['position_limit'], r['joint_inertia']
 
     @property
     def hover_thrust(self) -> float:
@@ -81,7 +58,7 @@ class Robot:
         r = self.numbers['robot']
         return r['mass'] * r['gravity'] / 4
 
-    def within_tolerance(self, rng: np.random.Generator) -> Robot:
+    def within_tolerance(self, rng: np.random.Generator) -> None:
         """Draw every parameter within the tolerances, uniformly; changes this robot."""
         tolerance = self.numbers['tolerance']
 
@@ -95,4 +72,3 @@ class Robot:
         self.time_constant = self.time_constant * (1 + draw('lag', 4))
         self.kp = self.kp * (1 + draw('lag', 4))
         self.kd = self.kd * (1 + draw('lag', 4))
-        return self

@@ -1,21 +1,16 @@
 """The slow balance of torques against dense densities, and on flights with a weak rotor."""
 
 from math import exp, log
-from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 from scipy.stats import multivariate_normal
+from test_engine import BESIDE, gap_of, motor_volts, ROBOT
 
 from beetle_omni_ros.identify.flights.balance import Balance, SCALES, SCATTER, SESSION, SLOW
 from beetle_omni_ros.identify.flights.priors import keys_of, spread
-from beetle_omni_ros.identify.gap.command import gap_results
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
 
-ROBOT = share_path('params/crazyflie.yaml')
-BESIDE = Path(__file__).parents[3] / 'shared/data/flights'
 HEADER = ('t,ekf_px,ekf_py,ekf_pz,ekf_vx,ekf_vy,ekf_vz,ekf_ax,ekf_ay,ekf_az,ekf_roll,ekf_yaw,'
           'pwm1,pwm2,pwm3,pwm4,vbat')
 ARM, WEIGHT = 0.03253, 0.0319 * 9.81
@@ -41,16 +36,13 @@ def write_flight(path, seed, scale=(1, 1, 1, 1), hub=5e-4, load=(0.0, 0.0), move
     arms = np.array([[1, 1, 1, 1], [-ARM, -ARM, ARM, ARM], [-ARM, ARM, ARM, -ARM],
                      [1, -1, 1, -1]])
     thrust = np.linalg.solve(arms, need.T).T / scale
-    grid = np.linspace(0, 5, 5001)
-    volts = np.interp(thrust, -0.01483 + 0.04724 * grid - 0.01847 * grid**2 + 0.005961 * grid**3,
-                      grid)
     place = np.cumsum(speed) * 0.00992
     up = rng.normal(size=(len(t), 3)) * 0.05
     up[:, 0] += slope
     np.savetxt(path, np.column_stack([
         t, place, 0 * t, height, speed, 0 * t, np.gradient(height, t), up, 0 * t, 0 * t,
-        volts / 3.8 * 65535, np.full(len(t), 3.8)]), delimiter=',', header=HEADER, comments='',
-        fmt='%.7g')
+        motor_volts(thrust) / 3.8 * 65535, np.full(len(t), 3.8)]), delimiter=',', header=HEADER,
+        comments='', fmt='%.7g')
     return path
 
 
@@ -59,7 +51,7 @@ def members(result):
 
 
 def judged(paths, robot=ROBOT):
-    return gap_results(paths, [], robot, form='crazypad_motor', console=Console(quiet=True))
+    return gap_of(paths, 'crazypad_motor', robot)
 
 
 def test_evidence_and_estimate_agree_with_dense_densities():

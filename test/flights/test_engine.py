@@ -123,6 +123,13 @@ def test_noise_of_a_flexible_fit_is_not_too_small():
     assert np.mean(variances) == pytest.approx(0.01, rel=0.15)
 
 
+def motor_volts(thrust):
+    """Motor voltages that give thrusts [N] by the published map."""
+    grid = np.linspace(0, 5, 5001)
+    return np.interp(thrust, -0.01483 + 0.04724 * grid - 0.01847 * grid**2 + 0.005961 * grid**3,
+                     grid)
+
+
 def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0, late=0.0, bias=0.0,
                  wander=0.002):
     """
@@ -159,10 +166,7 @@ def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0, late=0
         np.linalg.norm(thrust, axis=1)[None], torque.T])).T / scale
     force = lagged + 0.06 * np.gradient(lagged, 0.01, axis=0)
     volts = 4.0 - 0.5 * t / seconds - 0.05 * rng.random()
-    grid = np.linspace(0, 5, 5001)
-    motor = np.interp(force, -0.01483 + 0.04724 * grid - 0.01847 * grid**2 + 0.005961 * grid**3,
-                      grid)
-    duty = motor / (volts[:, None] if sag else 3.7)
+    duty = motor_volts(force) / (volts[:, None] if sag else 3.7)
     specific = np.einsum('nji,nj->ni', matrix, need) / 0.0319 + [0, 0, bias]
     # coloured noise: white and a slow wander
     noise = rng.normal(size=(len(t), 3)) * 0.05 + np.cumsum(
@@ -178,7 +182,7 @@ def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0, late=0
     return path
 
 
-def gap_of(flights, form, robot, **more):
+def gap_of(flights, form='nanobench', robot=ROBOT, **more):
     return gap_results(flights, robot=robot, form=form, console=Console(quiet=True), **more)
 
 
@@ -188,7 +192,7 @@ def named(result):
 
 def test_a_hidden_thrust_and_drag_are_named_with_their_sizes(tmp_path):
     flights = [write_flight(tmp_path / f'{k}.csv', k, scale=0.8, drag=0.012) for k in range(3)]
-    result = gap_of(flights, 'nanobench', ROBOT)
+    result = gap_of(flights)
     found = {effect['names'][0]: effect['parameters'] for effect in result['effects']}
     assert {'thrust_coefficient', 'rotor_drag'} == set(found)
     for name, key, true in (('thrust_coefficient', 'scale', 0.8),
@@ -201,7 +205,7 @@ def test_a_hidden_thrust_and_drag_are_named_with_their_sizes(tmp_path):
 
 def test_flights_of_the_robot_of_the_file_have_no_named_effect(tmp_path):
     flights = [write_flight(tmp_path / f'{k}.csv', 10 + k) for k in range(3)]
-    result = gap_of(flights, 'nanobench', ROBOT)
+    result = gap_of(flights)
     assert not result['effects']
     assert result['false_alarm_probability'] > 0.05
 
@@ -210,7 +214,7 @@ def test_a_file_that_ignores_the_voltage_is_told_so(tmp_path):
     robot = tmp_path / 'robot.yaml'
     robot.write_text('extends: crazyflie.yaml\neffects: {}\n')
     flights = [write_flight(tmp_path / f'{k}.csv', 20 + k) for k in range(3)]
-    result = gap_of(flights, 'nanobench', robot, apply=tmp_path / 'corrected.yaml')
+    result = gap_of(flights, robot=robot, apply=tmp_path / 'corrected.yaml')
     assert 'voltage_sag' in named(result)
     assert 'voltage_sag' in (tmp_path / 'corrected.yaml').read_text()
 
@@ -245,10 +249,10 @@ def test_a_clock_that_wanders_takes_out_the_pair_and_not_the_flight(tmp_path):
     away = np.repeat(np.random.default_rng(5).normal(size=18) * 0.12, 200)
     paths = [write_flight(tmp_path / f'{k}.csv', 60 + k, scale=0.8, late=late)
              for k, late in enumerate((away, 0.02))]
-    result = gap_of(paths[:1], 'nanobench', ROBOT)
+    result = gap_of(paths[:1])
     assert result['groups']['force']['used'] and not result['groups']['rate']['used']
     assert 'wander by' in result['groups']['acceleration']['reason']
-    both = gap_of(paths, 'nanobench', ROBOT)
+    both = gap_of(paths)
     assert both['groups']['acceleration']['used'] and 'thrust_coefficient' in named(both)
     assert [text.split(':')[0] for text in both['findings']] == ['0.csv']
 
@@ -260,7 +264,7 @@ def test_what_a_format_lacks_is_listed_with_its_reason(tmp_path):
                     'duty: {columns: [pwm1, pwm2, pwm3, pwm4], full: 65535}\n'
                     'voltage: {columns: [vbat], unit: V}\n')
     flights = [write_flight(tmp_path / f'{k}.csv', 30 + k) for k in range(2)]
-    result = gap_of(flights, str(form), ROBOT)
+    result = gap_of(flights, str(form))
     groups = result['groups']
     assert groups['force'] == {'used': True, 'channels': ['force_z'], 'reason': (
         'no specific force or acceleration along this axis')}
@@ -275,25 +279,25 @@ def test_flights_on_the_ground_and_other_channels_are_told_by_name(tmp_path):
     cells = [line.split(',') for line in lines]
     ground.write_text('\n'.join([lines[0], *(','.join([*c[:3], '0', *c[4:]])
                                              for c in cells[1:])]))
-    assert gap_of([ground], 'nanobench', ROBOT)['verdict'] == 'bad_data'
-    result = gap_of([good, ground], 'nanobench', ROBOT)
+    assert gap_of([ground])['verdict'] == 'bad_data'
+    result = gap_of([good, ground])
     assert result['findings'] == ['ground.csv: not used, no block of commands and measurements '
                                   'in the air']
     blind = tmp_path / 'blind.csv'
     blind.write_text('\n'.join([lines[0], *(','.join([*c[:8], '', *c[9:]]) for c in cells[1:])]))
     with pytest.raises(ParameterError, match='blind.csv: its channels are force_y'):
-        gap_of([good, blind], 'nanobench', ROBOT)
+        gap_of([good, blind])
 
 
 def test_duty_needs_a_robot_with_a_motor_map(tmp_path):
     flight = write_flight(tmp_path / 'a.csv', 1, seconds=5)
     with pytest.raises(ParameterError, match="'rotors.motor' is missing"):
-        gap_of([flight], 'nanobench', None)
+        gap_of([flight], robot=None)
 
 
 @pytest.mark.timeout(600)
 def test_real_flights_name_thrust_and_drag_and_never_an_inertia():
-    result = gap_of(sorted(REAL.glob('*.csv.gz')), 'nanobench', ROBOT)
+    result = gap_of(sorted(REAL.glob('*.csv.gz')))
     assert {'thrust_coefficient', 'rotor_drag'} <= named(result)
     assert not {'inertia', 'torque_coefficient', 'wind'} & named(result)
     assert result['groups']['acceleration']['used'] and result['groups']['rate']['used']
@@ -305,4 +309,4 @@ def test_real_flights_name_thrust_and_drag_and_never_an_inertia():
 @pytest.mark.skipif(not BESIDE.is_dir(), reason='further flights are not beside the repository')
 def test_short_real_flights_name_no_inertia():
     flights = [BESIDE / f'nano_B2_circle_{name}_rep1.csv.gz' for name in ('slow', 'fast')]
-    assert 'inertia' not in named(gap_of(flights, 'nanobench', ROBOT))
+    assert 'inertia' not in named(gap_of(flights))

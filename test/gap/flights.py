@@ -120,6 +120,6 @@ def solved(made, names, groups, base=None, start=None, iterations=3):
             x.append(linear.slopes[:, own][counts])
         change = np.linalg.lstsq(np.concatenate(x), -np.concatenate(y), rcond=None)[0]
         for name, step in zip(names, change, strict=True):
-            theta[name] = float(np.clip(theta[name] + step, made.keys[name].low,
-                                        made.keys[name].high))
+            least = -made.keys[name].base if made.keys[name].ends_at_none else -np.inf
+            theta[name] = float(max(theta[name] + step, least))
     return theta

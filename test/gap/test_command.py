@@ -16,11 +16,10 @@ from rich.console import Console
 
 import beetle_omni_ros
 from beetle_omni_ros import cli
-from beetle_omni_ros.cli import spread
 from beetle_omni_ros.identify.gap.command import gap_results, run_gap
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import names_of, read_messages
+from beetle_omni_ros.runs.bag import read_messages
 from beetle_omni_ros.runs.bag_writer import BagWriter
 
 EXAMPLE = Path(__file__).parents[2] / 'examples' / 'gap_two_bags.py'
@@ -148,17 +147,3 @@ def test_the_base_file_is_not_overwritten(tmp_path):
     with pytest.raises(ParameterError, match='extends'):
         run_gap([tmp_path], robot=tmp_path / 'mine.yaml', apply=tmp_path / 'mine.yaml',
                 console=quiet())
-
-
-@pytest.mark.parametrize(('given', 'meant'), [
-    ('a b --holdout c --json g', 'a b --holdout c --json g'),
-    ('--robot r a b --holdout c d', '--robot r a b --holdout c --holdout d')])
-def test_every_run_after_holdout_is_held_out(given, meant):
-    assert spread(given.split()) == meant.split()
-
-
-@pytest.mark.parametrize('paths, names', [
-    (['/a/one', '/a/two'], ['one', 'two']), (['/a/one/bag', '/a/two/bag'], ['one/bag', 'two/bag']),
-    (['/a/1/x/bag', '/b/1/x/bag'], ['a/1/x/bag', 'b/1/x/bag'])])
-def test_recordings_have_distinct_names(paths, names):
-    assert names_of([Path(path) for path in paths]) == names

@@ -12,6 +12,7 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc import NmpcParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.identify.gap.keys import number_of
 from beetle_omni_ros.robot import dynamics, effects
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.effects import CATALOGUE
@@ -22,13 +23,6 @@ from beetle_omni_ros.sim.simulator import CommandLink, Simulator
 ROBOT, WORLD = RobotParameters.load(), SimulatorParameters.load()
 
 
-def number(robot, key):
-    """Value of a robot file at a dotted key."""
-    for part in key.split('.'):
-        robot = getattr(robot, part)
-    return np.array(robot, dtype=float)
-
-
 def with_effect(name):
     """The robot with an effect of typical size; values of the file decrease by it."""
     values = {}
@@ -36,7 +30,7 @@ def with_effect(name):
         if spec.form:
             values[parameter] = spec.neutral
         elif spec.number:
-            values[parameter] = (1 - spec.typical) * number(ROBOT, spec.number)
+            values[parameter] = (1 - spec.typical) * number_of(ROBOT, spec.number)
         else:
             values[parameter] = np.array(spec.neutral) + spec.typical
     return replace(ROBOT, effects={name: {

@@ -16,7 +16,7 @@ import yaml
 from beetle_omni_ros.identify.gap.bags import read_recording
 from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.recording.check import repaired
+from beetle_omni_ros.identify.recording.check import checked
 from beetle_omni_ros.identify.recording.damage import changed
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.identify.recording.readings import sensor_damages
@@ -136,10 +136,6 @@ def interleaved(made):
     return made
 
 
-def stale(made):
-    return of(IMU, 0, 6, lambda v: v[np.arange(len(v)) // 2 * 2])(made)
-
-
 def reordered(made):
     order = np.arange(len(made.times[POSE]))
     for k in range(10, len(order) - 10, 20):
@@ -159,12 +155,6 @@ def flipped_from_half(made):
     late = late_half(made, POSE)
     q = Rotation.from_quat(made.values[POSE][late, 3:]) * QUARTER
     made.values[POSE][late, 3:] = q.as_quat()
-    return made
-
-
-def drifting(made):
-    t = made.times[POSE]
-    made.times[POSE] = t + 0.01 * (t - t[0])
     return made
 
 
@@ -194,6 +184,7 @@ def silent_clock(change):
 
 
 QUARTER = Rotation.from_euler('z', 90, degrees=True)
+drifting = stamped(POSE, lambda t: t + 0.01 * (t - t[0]))
 BOTH = slice(0, 3), slice(3, 6)
 # name -> damage, topic, words of which the cause must contain one, time [s] or None
 KINDS = {
@@ -235,7 +226,7 @@ KINDS = {
                         None),
     'IMU turned on the way': (turned(IMU, BOTH, QUARTER, late=True), IMU, ['turned'], HALF),
     'IMU spike': (spiked(IMU, 3000, 1, 1e6), IMU, ['spike'], 15.0),
-    'IMU stale': (stale, IMU, ['repeat'], None),
+    'IMU stale': (of(IMU, 0, 6, lambda v: v[np.arange(len(v)) // 2 * 2]), IMU, ['repeat'], None),
     'gyroscope clipped': (of(IMU, 3, 6, lambda v: np.clip(v, -0.5, 0.5)), IMU, ['clipped'], None),
     'one gyroscope axis frozen': (frozen(IMU, 12, 20, 4), IMU, ['frozen'], 12.0),
     'joints swapped': (of(JOINTS, 0, 4, lambda v: v[:, [1, 0, 2, 3]]), JOINTS, ['swapped'], None),
@@ -348,11 +339,11 @@ def test_a_joint_that_rests_until_its_command_arrives_is_not_frozen(seed):
     rng, limits = np.random.default_rng(seed), RecordingLimits.load()
     size, lag = rng.choice([-1, 1]) * rng.uniform(0.27, 0.35), rng.uniform(0, 0.3)
     for end in (rng.uniform(0, lag), rng.uniform(lag, 1.0), 10.0):
-        found = sensor_damages(joint_step(size, lag, end), limits)
+        found = sensor_damages(joint_step(size, lag, end))
         assert not found, (size, lag, end, found[0].text)
     # Frozen at any time before the step, it is found once every valid servo would have turned.
     held = joint_step(size, lag, limits.servo_lag[1] + 0.1, frozen_from=0.0)
-    damage, = sensor_damages(held, limits)
+    damage, = sensor_damages(held)
     assert damage.topic == JOINTS and 'gimbal2 is frozen' in damage.cause
 
 
@@ -362,7 +353,7 @@ def test_a_joint_that_rests_until_its_command_arrives_is_not_frozen(seed):
                                   'IMU spike', 'IMU stale', 'IMU upside down', 'marker flips'])
 def test_a_repair_restores_the_sound_recording(kind):
     sound = recording()
-    fixed, done, left = repaired(KINDS[kind][0](recording()), ROBOT)
+    fixed, done, left = checked(KINDS[kind][0](recording()), ROBOT, 0.0, fix=True)
     assert done and left == []
     for topic in (IMU, POSE, JOINTS, COMMAND):
         t = sound.times[topic]

@@ -20,7 +20,7 @@ P, ROBOT = GapParameters.load(), RobotParameters.load()
 
 def flights(folder, seed, *effects, **more):
     case = Case('singles' if effects else 'none', 'hard', seed, effects, duration=40.0,
-                gust=True, multibody=True, tolerance=True, command_age=0.01, **more)
+                gust=True, multibody=True, tolerance=True, **more)
     made = make_case(case, folder / 'flights', folder / 'sealed')
     return [load_flight(made / name, ROBOT, P) for name in ('fit_1', 'fit_2', 'holdout_1')]
 

@@ -4,6 +4,7 @@ from gap_data.cases import load_settings
 from gap_data.effects import CATALOGUE, inject, SHAPES
 from gap_data.hidden import Hidden, Snapshot
 from gap_data.plant import Plant
+from gap_data.rotors import Rotors
 from gap_data.truth import Robot
 import numpy as np
 import pytest
@@ -12,11 +13,11 @@ from scipy.spatial.transform import Rotation
 SETTINGS = load_settings()
 ALL = [(name, shape) for name in CATALOGUE for shape in ('plain', *SHAPES.get(name, ()))]
 UP = (0.0, 0.0, 1.0)
-HOVER, LOW = Robot.nominal().hover_thrust, Robot.nominal().positions[0, 2]
+HOVER, LOW = Robot().hover_thrust, Robot().positions[0, 2]
 
 
 def put(name, size, shape='plain', seed=0):
-    robot, hidden = Robot.nominal(), Hidden()
+    robot, hidden = Robot(), Hidden()
     label = inject(name, robot, hidden, size, shape, np.random.default_rng(seed))
     return robot, hidden, label
 
@@ -105,7 +106,6 @@ def test_gyroscopic_torque_is_the_change_of_angular_momentum(shape):
 @shapes('rotor_lag')
 def test_rotor_lag_delays_thrust_by_its_time_constant(shape):
     robot, hidden, label = put('rotor_lag', 0.03, shape)
-    from gap_data.rotors import Rotors
     delays = []
     for low, high in ((5.0, 6.0), (6.0, 5.0)):
         rotors = Rotors(robot, hidden, 0.001, [low] * 4)

@@ -5,9 +5,7 @@ from gap_data.judge import judge
 from gap_data.score import score
 import pytest
 
-CASE = {'kind': 'singles', 'difficulty': 'hard', 'multiple': 0.0, 'noise': 1.0, 'gust': True,
-        'conditions': 'nominal', 'multibody': True, 'damage': '', 'course': 'poses',
-        'command_age': 0.01}
+CASE = {'kind': 'singles', 'difficulty': 'hard'}
 DRAG = {'name': 'rotor_drag', 'shape': 'plain', 'size': 0.4, 'in_catalogue': True,
         'parameters': {'coefficient': 0.4}}
 LAG = {'name': 'command_latency', 'shape': 'plain', 'size': 0.02, 'in_catalogue': True,
@@ -29,16 +27,13 @@ def effect(*names, value=0.41, interval=(0.38, 0.44), parameter='coefficient', *
 def run(*effects, verdict='named', **more):
     answer = {'verdict': verdict, 'effects': list(effects), 'closure': 0.9, 'gap_before': 4.0,
               'gap_after': 1.2, 'noise_floor': 1.0, 'next_experiment': None, **more}
-    return {'answer': answer, 'problems': [], 'status': 0, 'wall_s': 5.0, 'cpu_s': 4.0,
-            'traceback': False, 'message': ''}
+    return {'answer': answer, 'problems': [], 'wall_s': 5.0, 'cpu_s': 4.0, 'traceback': False,
+            'message': ''}
 
 
 NONE = label(kind='none', accept=('no_gap',))
 HOVER = label({**ROTOR, 'name': 'mass', 'parameters': {'mass': 3.3}}, kind='undecidable',
               accept=('not_decidable',), sets=('mass', 'thrust_coefficient'))
-BAD = label(kind='damaged', accept=('bad_data', 'refused'))
-REFUSED = {'answer': None, 'problems': ['no JSON'], 'status': 2, 'wall_s': 1.0, 'cpu_s': 1.0,
-           'traceback': False, 'message': 'bag/: topic imu/data_raw is missing'}
 WIND = effect('wind', parameter='force')
 SECOND, FOURTH = (effect(ROTOR['name'], value=0.9, interval=(0.89, 0.91), parameter='scale',
                          rotor=rotor) for rotor in (2, 4))
@@ -57,20 +52,11 @@ SECOND, FOURTH = (effect(ROTOR['name'], value=0.9, interval=(0.89, 0.91), parame
     ({**NONE, 'allowed': []}, run(effect('module_reaction')), False, None),
     (HOVER, run(verdict='not_decidable'), True, []), (HOVER, run(verdict='no_gap'), False, []),
     (HOVER, run(effect('thrust_coefficient', 'mass'), verdict='named_set'), True, []),
-    (HOVER, run(effect('mass')), False, None),
-    # bad bags need the verdict, or one line
-    (BAD, REFUSED, True, None), (BAD, {**REFUSED, 'message': 'a\nb'}, False, None),
-    (BAD, {**REFUSED, 'traceback': True}, False, None), (BAD, run(verdict='bad_data'), True, []),
-    (BAD, run(effect('mass')), False, None)])
+    (HOVER, run(effect('mass')), False, None)])
 def test_an_answer_is_judged_by_its_names(truth, answer, right, wrong):
     judged = judge(truth, answer)
     assert bool(judged['right']) == right
     assert judged['wrong'] == wrong or wrong is None
-
-
-def test_a_set_with_the_truth_is_not_exact():
-    assert judge(label(DRAG), run(effect('rotor_drag')))['exact'] == [True]
-    assert judge(label(DRAG), run(effect('body_drag', 'rotor_drag')))['exact'] == [False]
 
 
 def test_a_parameter_error_counts_from_the_described_value():
@@ -78,15 +64,13 @@ def test_a_parameter_error_counts_from_the_described_value():
                                             parameter='scale')))
     row, = judged['parameters']
     assert row['of_effect'] == pytest.approx(0.2)
-    assert row['of_value'] == pytest.approx(0.02 / 0.9)
     assert row['inside'] == [False]
 
 
 def test_command_delays_may_be_counted_from_the_stamp_or_beyond_the_nominal_age():
-    for value, reading in ((0.0205, 'extra'), (0.0305, 'total')):
+    for value in (0.0205, 0.0305):
         row, = judge(label(LAG), run(effect('command_latency', parameter='delay', value=value,
                                             interval=(value - 1e-3, value + 1e-3))))['parameters']
-        assert row['reading'] == reading
         assert row['error'] == pytest.approx(0.0005) and row['inside'] == [True]
 
 
@@ -99,11 +83,11 @@ def test_scores_of_a_perfect_workflow_and_of_one_without_answers():
     silent = [judge(x, run(verdict='no_gap', closure=None)) for x in (label(DRAG), none, pair)]
 
     def value(rows, name):
-        return next(r for r in score(rows)['criteria']['hard'] if r['name'] == name)['value']
+        return next(r for r in score(rows)['hard'] if r['name'] == name)['value']
 
     for name, good, bad in (('single: named, or the right set', 1, 0),
                             ('none: false alarm', 0, 0), ('pair: both named', 1, 0),
-                            ('pair: at least one named', 1, 0), ('closure, single', 0.9, 0.0),
+                            ('closure, single', 0.9, 0.0),
                             ('interval covers the truth', 1, None)):
         assert value(right, name) == (pytest.approx(good))
         assert value(silent, name) == (bad if bad is None else pytest.approx(bad))

@@ -14,7 +14,7 @@ BODIES = pytest.mark.parametrize('multibody', [False, True], ids=['rigid', 'mult
 
 
 def plant(robot=None, hidden=None, *, multibody=False, thrust=None, tilt=(0, 0, 0, 0), **more):
-    robot = robot or Robot.nominal()
+    robot = robot or Robot()
     thrust = [robot.hover_thrust] * 4 if thrust is None else thrust
     return Plant(robot, hidden or Hidden(), multibody=multibody, position=(0, 0, 2),
                  quaternion=(1, 0, 0, 0), tilt=tilt, thrust=thrust, **more)
@@ -50,7 +50,7 @@ def test_multibody_totals_equal_those_of_the_interface():
 
 
 def test_multibody_keeps_energy_and_momentum_without_forces():
-    robot = Robot.nominal()
+    robot = Robot()
     robot.kp, robot.kd = np.zeros(4), np.zeros(4)
     body = plant(robot, multibody=True, thrust=[0.0] * 4, rate=(1.0, -2.0, 1.5))
     body.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
@@ -81,7 +81,7 @@ def test_the_step_response_of_a_servo_agrees_with_its_equation():
 
 @pytest.mark.parametrize('rotor', range(4))
 def test_thrust_acts_along_the_tilted_rotor(rotor):
-    robot = Robot.nominal()
+    robot = Robot()
     angle, thrust = 0.4, np.eye(4)[rotor] * 6.0
     body = plant(robot, thrust=thrust, tilt=[angle] * 4)
     body.command(0.0, [angle] * 4, thrust)
@@ -109,9 +109,8 @@ HARD = {'multibody': True, 'gust': True, 'conditions': 'published'}
 CLEAN = {'multibody': False, 'gust': False, 'conditions': 'nominal'}
 
 
-def flown(kind, seconds, difficulty, robot=None, hidden=None):
-    return fly(robot or Robot.nominal(), hidden or Hidden(), kind=kind, duration=seconds, seed=2,
-               command_age=0.01, **difficulty)
+def flown(kind, seconds, difficulty, robot=None):
+    return fly(robot or Robot(), Hidden(), kind=kind, duration=seconds, seed=2, **difficulty)
 
 
 @pytest.mark.parametrize('difficulty', [CLEAN, HARD], ids=['clean', 'hard'])
@@ -127,15 +126,15 @@ def test_the_controller_tracks_its_reference(kind, difficulty):
 
 
 def test_a_robot_that_cannot_fly_gives_a_lost_flight():
-    robot = Robot.nominal()
+    robot = Robot()
     robot.thrust_scale = np.full(4, 0.3)
     with pytest.raises(LostFlight, match='poses flight, seed 2'):
-        fly(robot, Hidden(), kind='poses', duration=5.0, seed=2, command_age=0.0, **CLEAN)
+        flown('poses', 5.0, CLEAN, robot)
 
 
 def test_a_hidden_effect_appears_in_flight_with_its_size():
     # the accelerometer gives the thrust along the body axes for any controller
-    robot = Robot.nominal()
+    robot = Robot()
     robot.thrust_scale = np.full(4, 0.92)
     truth = flown('poses', 6.0, CLEAN, robot=robot)
     tilt, thrust = truth.columns['tilt'], truth.columns['thrust']

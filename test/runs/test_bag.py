@@ -1,5 +1,6 @@
 """Bags: round trip, independent readers, truncated files, refusals."""
 
+from pathlib import Path
 
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
@@ -19,7 +20,7 @@ from synthetic_flights import (
 from beetle_omni_ros.messages.bag_types import new, to_bytes, TYPESTORE
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.runs.bag import names_of, read_bag
 from beetle_omni_ros.runs.bag_writer import add_meta, BagWriter
 from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder
 from beetle_omni_ros.runs.tasks import make_task
@@ -145,3 +146,10 @@ def test_meta_data_can_be_added_to_a_finished_bag(tmp_path):
     assert read_bag(tmp_path / 'bag').meta == {'task': 'hover', 'seed': 3}
     with AnyReader([tmp_path / 'bag'], default_typestore=TYPESTORE) as reader:
         assert reader.message_count == 1
+
+
+@pytest.mark.parametrize('paths, names', [
+    (['/a/one', '/a/two'], ['one', 'two']), (['/a/one/bag', '/a/two/bag'], ['one/bag', 'two/bag']),
+    (['/a/1/x/bag', '/b/1/x/bag'], ['a/1/x/bag', 'b/1/x/bag'])])
+def test_recordings_have_distinct_names(paths, names):
+    assert names_of([Path(path) for path in paths]) == names

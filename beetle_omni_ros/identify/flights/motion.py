@@ -4,6 +4,8 @@ import numpy as np
 from scipy.fft import dct, idct
 from scipy.spatial.transform import Rotation
 
+from beetle_omni_ros.identify.gap.series import aligned
+
 BRIDGED = 0.06      # [s] gaps of inputs that interpolation bridges, about a rotor lag
 SMOOTH = 0.05       # [s] moving average of positions before their derivative
 WINDOW = 2.0        # [s] in which one shift of two clocks is measured
@@ -31,7 +33,7 @@ def poses(table, far):
         [0.0, 0.0, far], (len(table), 1))
     if 'quaternion' not in v:
         return position, None, np.inf
-    quaternion, seen = filled(signed(v['quaternion']), h)
+    quaternion, seen = filled(aligned(v['quaternion']), h)
     deviation = table.format.clock_deviation
     imu = next((signals[name].clock for name in ('angular_velocity', 'specific_force')
                 if name in v), None)
@@ -120,16 +122,6 @@ def derivative(values, period):
     """Fourth-order central differences (N, n), NaN beside missing samples and at the ends."""
     out = np.full(values.shape, np.nan)
     out[2:-2] = (8 * (values[3:-1] - values[1:-3]) - (values[4:] - values[:-4])) / (12 * period)
-    return out
-
-
-def signed(quaternion):
-    """Quaternions (N, 4) with continuous signs."""
-    out = np.array(quaternion)
-    there = np.flatnonzero(np.isfinite(out).all(axis=1))
-    flips = np.sign((out[there[1:]] * out[there[:-1]]).sum(axis=1))
-    flips[flips == 0] = 1
-    out[there] *= np.concatenate([[1.0], np.cumprod(flips)])[:, None]
     return out
 
 

@@ -10,45 +10,48 @@ import numpy as np
 from beetle_omni_ros.identify.flights.discrepancy import discrepancies
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.solution import Solution
-from beetle_omni_ros.identify.flights.spectrum import pooled, spectrum
+from beetle_omni_ros.identify.flights.spectrum import pooled, Spectrum, spectrum
+
+
+def fitted(engine: Engine, solution: Solution, k: int) -> np.ndarray:
+    """(K,) keys of flight k, without the discrepancy."""
+    x = solution.equations.of_flight(k, solution.theta)[:len(engine.names)]
+    x[:engine.known] += solution.theta[:engine.known]
+    return x
+
+
+def noise_of(found: Spectrum) -> np.ndarray:
+    """(F, C) standard deviations of the noise of the coefficients."""
+    return np.sqrt(np.diagonal(found.noise, axis1=1, axis2=2))[found.band]
 
 
 def explained(engine: Engine, solution: Solution, group: str) -> float:
     """Share of the variance of a group's measurements that the fit predicts, by motion."""
+    own = [c for c, name in enumerate(engine.channels) if name.startswith(group)]
     left = total = 0.0
     for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
-        own = [c for c, name in enumerate(flight.channels) if name.startswith(group)]
         # without the generic discrepancy, which predicts what feedback leaves
-        x = solution.equations.of_flight(k, solution.theta)[:len(engine.names)]
-        x[:engine.known] += solution.theta[:engine.known]
+        x = fitted(engine, solution, k)
         # a fit of feedback makes the robot heavier; the inertia is that of the file
         x[[k for k, name in enumerate(engine.names) if name.startswith('inertia.')]] = 0.0
-        moving = found.band > 0
-        moving[found.counts[0]:] = False
-        left += (((found.residual + found.slopes @ x) / np.sqrt(np.diagonal(
-            found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
         measured = spectrum(flight.linear({}, []).measured, np.zeros((*flight.mask.shape, 0)),
                             flight.mask, flight.period, found.floor, flight.highest,
                             engine.groups, engine.filters[k])
-        total += ((measured.residual / np.sqrt(np.diagonal(
-            found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
+        moving = found.band > 0
+        moving[found.counts[0]:] = False
+        rest, all_of_it = ((x / noise_of(found))[:, moving][:, :, own] for x in (
+            found.residual + found.slopes @ x, measured.residual))
+        left, total = left + (rest**2).sum(), total + (all_of_it**2).sum()
     return 1 - left / total
 
 
-def disagreement(engine: Engine, solution: Solution) -> list[tuple[str, float, float]]:
-    """Channel, RMS of the file's residual over the noise, RMS of the discrepancy."""
+def discrepancy_sizes(engine: Engine, solution: Solution) -> list[float]:
+    """RMS of the discrepancy in each channel, with its unit."""
     weights = solution.equations.of_generic(solution.theta)
-    raw = [flight.linear({}, []).residual for flight in engine.flights]
-    rows = []
-    for c, name in enumerate(engine.channels):
-        here = [flight.mask[:, c] for flight in engine.flights]
-        found = np.concatenate([g[m, c].reshape(m.sum(), len(weights)) @ weights
-                                for g, m in zip(engine.generic, here, strict=True)])
-        size = np.sqrt(np.mean(np.concatenate([r[m, c] for r, m in zip(
-            raw, here, strict=True)])**2))
-        noise = np.sqrt(np.mean([power[c] for power in engine.power]))
-        rows.append((name, float(size / noise), float(found.std())))
-    return rows
+    return [float(np.concatenate([
+        generic[flight.mask[:, c], c].reshape(-1, len(weights)) @ weights
+        for flight, generic in zip(engine.flights, engine.generic, strict=True)]).std())
+        for c in range(len(engine.channels))]
 
 
 def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Sequence
@@ -106,10 +109,7 @@ def left_of(engine: Engine, solution: Solution) -> list[np.ndarray]:
     """(B, F, C) whitened residual of each flight after the fit, without the discrepancy."""
     rows = []
     for k, found in enumerate(solution.spectra):
-        x = solution.equations.of_flight(k, solution.theta)[:len(engine.names)]
-        x[:engine.known] += solution.theta[:engine.known]
-        x[engine.known:] = 0.0
-        rest = found.residual + found.slopes @ x
+        rest = found.residual + found.slopes @ fitted(engine, solution, k)
         for key, values in solution.by_band:
             rest += found.slopes[:, :, :, key] * values[found.band][None, :, None]
         rows.append(rest)

@@ -13,7 +13,12 @@ from beetle_omni_ros.identify.flights.balance import Balance
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import Posterior
 from beetle_omni_ros.identify.flights.priors import Entry
-from beetle_omni_ros.identify.flights.quality import disagreement, errors
+from beetle_omni_ros.identify.flights.quality import (
+    discrepancy_sizes,
+    errors,
+    fitted,
+    noise_of,
+)
 from beetle_omni_ros.identify.flights.solution import log_prior, Solution
 from beetle_omni_ros.identify.flights.text import summary
 from beetle_omni_ros.identify.flights.unexplained import Unexplained, unexplained
@@ -94,19 +99,20 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
     taken = [[k for e, _, _, k, _ in found if e is test[0]] for test in tests]
     sets = [list(dict.fromkeys(s.entries[j].label if e is slow else s.entries[j].name
                                for j in members)) for e, s, _, _, members in found]
+    rows = [candidates_of(s, own) for (_, s, _), own in zip(tests, taken, strict=True)]
     rest = unexplained(engine, solution) if measured else []
     fed_back = sorted(solution.entries[k].name.replace('_', ' ') for k in solution.banned)
-    verdict = verdict_of(chance, sets, rest, fed_back, alpha)
+    verdict, reason = verdict_of(chance, sets, rest, fed_back, alpha)
     effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]
     return result_of(
-        verdict, groups, reason_of(verdict, sets, rest, fed_back, chance),
+        verdict, groups, reason,
         effects=[effect for effect, members in zip(effects, sets, strict=True)
                  if verdict in NAMING and len(members) < CROWD],
         partial=[effect for effect, members in zip(effects, sets, strict=True)
                  if verdict not in NAMING or len(members) >= CROWD],
-        candidates=sorted((row for (_, s, _), own in zip(tests, taken, strict=True)
-                           for row in candidates_of(s, own)), key=_rank, reverse=True),
-        hidden=[name for _, s, _ in tests for name in hidden_of(s, alpha / len(tests))],
+        candidates=sorted((row for own in rows for row in own), key=_rank, reverse=True),
+        hidden=[name for (_, s, _), own in zip(tests, rows, strict=True)
+                for name in hidden_of(own, len(s.entries), alpha / len(tests))],
         where=where_of(engine, solution), false_alarm_probability=chance,
         held_out=held_out, findings=[*findings, *varied(engine, solution), *(
             test.sentence[:1].upper() + test.sentence[1:] for test in rest
@@ -242,14 +248,16 @@ def _rank(row):
     return row['accepted'], -np.inf if gain is None else gain
 
 
-def hidden_of(solution: Solution, alpha: float) -> list[str]:
-    """Entries that would not be named at their typical size: their mean evidence is too small."""
-    count = len(solution.entries)
+def hidden_of(rows: list[dict], count: int, alpha: float) -> list[str]:
+    """
+    Entries that would not be named at their typical size: their mean evidence is too small.
+
+    ``rows``: of :func:`candidates_of`; ``count``: number of entries.
+    """
     best: dict[str, float] = {}
+    for row in sorted(rows, key=lambda row: _rank(row)[1], reverse=True):
+        best[row['name']] = max(best.get(row['name'], -np.inf), row['expected_ln_bayes_factor'])
     least = log(1 / alpha) + log_prior(0, count) - log_prior(1, count)
-    for row in candidates_of(solution, []):
-        name = row['name']
-        best[name] = max(best.get(name, -np.inf), row['expected_ln_bayes_factor'])
     return [name for name, evidence in best.items() if evidence < least]
 
 
@@ -262,16 +270,13 @@ def where_of(engine: Engine, solution: Solution) -> list[dict]:
     without discrepancy, and ``rms``, ``rms_after`` and ``discrepancy_rms`` of what repeats and is
     in no entry, with a unit.
     """
-    known, count, whitened, raw = engine.known, len(engine.names), [], []
+    known, whitened, raw = engine.known, [], []
     for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
-        x = solution.equations.of_flight(k, solution.theta)[:count]
-        x[:known] += solution.theta[:known]
-        x[known:] = 0.0
-        noise = np.sqrt(np.diagonal(found.noise, axis1=1, axis2=2))[found.band]
-        whitened.append([(r / noise).reshape(-1, len(engine.channels))
-                         for r in (found.residual, found.residual + found.slopes @ x)])
+        x = fitted(engine, solution, k)
+        whitened.append([(rest / noise_of(found)).reshape(-1, len(engine.channels))
+                         for rest in (found.residual, found.residual + found.slopes @ x)])
         raw.append([np.where(flight.mask, flight.linear(at, []).residual, np.nan)
-                    for at in ({}, dict(zip(engine.names[:known], x[:known], strict=True)))])
+                    for at in ({}, dict(zip(engine.names[:known], x, strict=False)))])
     excess, rms = (np.sqrt([np.nanmean(np.concatenate(parts)**2, axis=0)
                             for parts in zip(*own, strict=True)]) for own in (whitened, raw))
     rows: list[dict] = [
@@ -279,7 +284,8 @@ def where_of(engine: Engine, solution: Solution) -> list[dict]:
          'excess_after': float(excess[1, c]), 'rms': float(rms[0, c]),
          'rms_after': float(rms[1, c]), 'discrepancy_rms': discrepancy,
          'unit': UNITS[name.partition('_')[0]]}
-        for c, (name, _, discrepancy) in enumerate(disagreement(engine, solution))]
+        for c, (name, discrepancy) in enumerate(zip(
+            engine.channels, discrepancy_sizes(engine, solution), strict=True))]
     before = np.concatenate([parts[0] for parts in raw])
     regime = np.concatenate([regimes_of(flight.motion) for flight in engine.flights])
     for c, name in enumerate(engine.channels):
@@ -318,9 +324,9 @@ def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: li
 
 
 def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
-               fed_back: list[str], alpha: float) -> str:
+               fed_back: list[str], alpha: float) -> tuple[str, str]:
     """
-    Verdict on flights.
+    Verdict on flights and, without names, its reason as the end of a sentence.
 
     Args:
         chance: probability of as much evidence without any effect.
@@ -331,15 +337,21 @@ def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
 
     """
     if len(fed_back) > MOST_FED_BACK:
-        return 'not_decidable'
+        return 'not_decidable', (
+            'the controller answers noise more than it flies: the values of '
+            f"{', '.join(fed_back)} differ between frequencies")
     small = [len(members) for members in sets if len(members) < CROWD]
     if small:
-        return 'named_set' if max(small) > 1 else 'named'
+        return 'named_set' if max(small) > 1 else 'named', ''
     if sets:
-        return 'not_decidable'
+        return 'not_decidable', (
+            f"they do not separate {' and '.join(map(' or '.join, sets))}".replace('_', ' '))
     if rest and rest[0].probability < alpha / TESTS:
-        return 'unknown'
-    return 'no_gap' if chance > alpha else 'not_decidable'
+        return 'unknown', rest[0].sentence
+    if chance > alpha:
+        return 'no_gap', ''
+    return 'not_decidable', ('an effect is more likely than none, but a false alarm would have '
+                             f'the probability {chance:.2g}')
 
 
 def varied(engine: Engine, solution: Solution) -> list[str]:
@@ -355,19 +367,3 @@ def varied(engine: Engine, solution: Solution) -> list[str]:
             found.append(f"{entry.name.replace('_', ' ')} differs from flight to flight: "
                          + ', '.join(f'{value:.2g}' for value in values) + f' {unit}')
     return found
-
-
-def reason_of(verdict: str, sets: list[list[str]], rest: list[Unexplained],
-              fed_back: list[str], chance: float) -> str:
-    """Why a verdict without names was reached, as the end of a sentence."""
-    if verdict == 'unknown':
-        return rest[0].sentence
-    if verdict != 'not_decidable':
-        return ''
-    if len(fed_back) > MOST_FED_BACK:
-        return ('the controller answers noise more than it flies: the values of '
-                f"{', '.join(fed_back)} differ between frequencies")
-    if sets:
-        return f"they do not separate {' and '.join(map(' or '.join, sets))}".replace('_', ' ')
-    return ('an effect is more likely than none, but a false alarm would have the probability '
-            f'{chance:.2g}')

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, field
-import gzip
+from functools import partial
 import math
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError, quoted
-from beetle_omni_ros.runs.files import LogError
+from beetle_omni_ros.runs.files import LogError, read_table
 
 G = 9.80665     # [m/s^2] of a unit 'g', standard gravity
 # Signal -> width, and unit -> factor to SI.
@@ -118,31 +117,30 @@ def _signal(name, content, path):
         raise ParameterError(f"{where}: expected a mapping with keys of {', '.join(KEYS)}, found "
                              f'{quoted(content)}')
     columns = content.get('columns')
-    if isinstance(columns, str):
-        columns = [columns]
+    columns = [columns] if isinstance(columns, str) else columns
     if not isinstance(columns, list) or len(columns) != width or not all(
             column is None or isinstance(column, str) for column in columns):
         raise ParameterError(f"{where}: 'columns': expected {width} names (null: not recorded), "
                              f'found {quoted(columns)}')
-    unit = str(content.get('unit', '1'))
-    if unit not in units:
-        raise ParameterError(f"{where}: 'unit': expected one of {', '.join(units)}, found "
-                             f'{quoted(unit)}')
-    frames = FRAMES.get(name, ('',))
-    frame = content.get('frame', frames[0])
-    if frame not in frames:
-        raise ParameterError(f"{where}: 'frame': expected one of {', '.join(frames)}, found "
-                             f'{quoted(frame)}')
     sign = content.get('sign', [1] * width)
     if not isinstance(sign, list) or len(sign) != width or not all(s in (1, -1) for s in sign):
         raise ParameterError(f"{where}: 'sign': expected {width} of 1 or -1, found "
                              f'{quoted(sign)}')
-    order = content.get('order', 'xyzw')
-    if name == 'quaternion' and order not in ORDERS:
-        raise ParameterError(f"{where}: 'order': expected xyzw or wxyz, found {quoted(order)}")
+    frames = FRAMES.get(name, ('',))
+    unit = _one_of(units, content, 'unit', '1', where)
+    frame = _one_of(frames, content, 'frame', frames[0], where)
+    order = _one_of(ORDERS, content, 'order', 'xyzw', where)
     full = _number(content.get('full', 1.0), f"{where}: 'full'")
     return Signal(tuple(columns), np.array(sign) * units[unit] / full, frame,
                   ORDERS[order] if name == 'quaternion' else (), str(content.get('clock', 'log')))
+
+
+def _one_of(allowed, content, key, default, where):
+    value = str(content.get(key, default))
+    if value not in allowed:
+        raise ParameterError(f"{where}: {key!r}: expected one of {', '.join(allowed)}, found "
+                             f'{quoted(value)}')
+    return value
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,39 +177,13 @@ def read_flight(path: Path, form: Format) -> Table:
         LogError: with file, row and column.
 
     """
-    try:
-        opened = gzip.open if path.suffix == '.gz' else open
-        with opened(path, 'rt', newline='', encoding='utf-8') as file:
-            rows = list(csv.reader(file))
-    except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
-        raise LogError(f'{path}: cannot be read ({getattr(error, "strerror", None) or error})') \
-            from None
-    header = [name.strip() for name in rows[0]] if rows else []
-    absent = [column for signal in form.signals.values() for column in signal.columns
-              if column is not None and column not in header]
-    if absent:
-        raise LogError(f'{path}: no column {absent[0]!r}, which the format {form.name} declares; '
-                       f"found {quoted(', '.join(header))}")
-    numbers = np.full((len(rows) - 1, len(header)), np.nan)
-    for k, row in enumerate(rows[1:]):
-        if len(row) != len(header):
-            raise LogError(f'{path}: row {k + 2}: expected {len(header)} cells, found {len(row)}')
-        for c, cell in enumerate(row):
-            if cell:
-                try:
-                    numbers[k, c] = float(cell)
-                except ValueError:
-                    raise LogError(f'{path}: row {k + 2}, column {header[c]!r}: expected a number '
-                                   f'or an empty cell, found {quoted(cell)}') from None
-    values = {}
+    columns, _ = read_table(path, partial(_wanted, form), 'the columns of the format', gaps=True)
+    count, values = len(next(iter(columns.values()))), {}
     for name, signal in form.signals.items():
-        block = np.stack([numbers[:, header.index(column)] if column is not None
-                          else np.full(len(numbers), np.nan) for column in signal.columns], axis=1)
-        values[name] = block * signal.factor
-        if signal.order:
-            values[name] = values[name][:, signal.order]
-        if signal.frame == 'world_to_body':
-            values[name] = values[name] * [-1, -1, -1, 1]
+        block = np.stack([columns[column] if column else np.full(count, np.nan)
+                          for column in signal.columns], axis=1) * signal.factor
+        block = block[:, signal.order] if signal.order else block
+        values[name] = block * [-1, -1, -1, 1] if signal.frame == 'world_to_body' else block
     t = values.pop('time')[:, 0]
     if len(t) < 10 or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
         raise LogError(f'{path}: column {form.signals["time"].columns[0]!r}: expected at least 10 '
@@ -223,3 +195,11 @@ def read_flight(path: Path, form: Format) -> Table:
         on_grid[name] = np.full((place[-1] + 1, block.shape[1]), np.nan)
         on_grid[name][place] = block
     return Table(path.name, period, on_grid, form)
+
+
+def _wanted(form, header):
+    names = [column for signal in form.signals.values() for column in signal.columns if column]
+    for name in names:
+        if name not in header:
+            raise ParameterError(f'no column {name!r}, which the format {form.name} declares')
+    return list(dict.fromkeys(names))

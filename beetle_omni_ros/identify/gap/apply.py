@@ -20,15 +20,12 @@ MEMBERS = 4     # length of a list with one value for each rotor or joint
 def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
     """The file's effects and the first member of each of the ``named`` sets of the results."""
     effects = {name: dict(values) for name, values in robot.effects.items()}
-    parts = [(effect, effect['names'][0], effect['parameters']) for effect in named]
-    parts += [(effect, name, found) for effect in named
-              for name, found in effect.get('also', {}).items()]
-    for effect, name, parameters in parts:
-        entry = CATALOGUE[name]
+    for effect in named:
+        name = effect['names'][0]
         member = effect.get('rotor') or effect.get('joint')
         values = effects.setdefault(name, {})
-        for parameter, found in parameters.items():
-            spec = entry.parameters[parameter]
+        for parameter, found in effect['parameters'].items():
+            spec = CATALOGUE[name].parameters[parameter]
             value = found['value']
             if member:
                 value = found.get('written', value)     # a zero is reported over a log's angles

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from beetle_omni_ros.identify.gap.bags import NEEDED, OPTIONAL, read_recording, Recording
+from beetle_omni_ros.identify.gap.bags import NEEDED, read_recording, Recording
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import aligned
-from beetle_omni_ros.identify.recording.check import damages, repaired
+from beetle_omni_ros.identify.recording.check import checked
 from beetle_omni_ros.identify.recording.clocks import begin_of
-from beetle_omni_ros.identify.recording.damage import Damage
+from beetle_omni_ros.identify.recording.damage import changed, Damage
 from beetle_omni_ros.identify.recording.flown import flown
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -105,26 +105,17 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
                            for topic in missing)
         raise UnusableFlight(f'{name}: missing or nearly empty: {counts}', [
             Damage(name, topic, f'{len(recording.times[topic])} messages') for topic in missing])
-    part = flown(recording, robot, p)
+    part = flown(_with_charge(recording), robot, p)
     if part is None:
         raise _unusable(name, 'command', 'the robot does not fly: commanded thrust is never above '
                         f'{p.lifted:g} of its weight')
     origin = begin_of(recording)
-    stamps = part[0].times['battery_state']
-    before = _drawn_until(recording, stamps[np.isfinite(stamps)][:1])
     recording, lead = part
-    findings = list(recording.warnings)
-    if fix:
-        recording, done, wrong = repaired(recording, robot, origin)
-        findings += done
-    else:
-        wrong = damages(recording, robot, origin)
+    recording, done, wrong = checked(recording, robot, origin, fix)
+    findings = [*recording.warnings, *done]
     if wrong:
         raise UnusableFlight(wrong[0].text, wrong)
     series = {topic: _in_order(name, topic, recording, findings) for topic in recording.times}
-    t, battery = series['battery_state']
-    series['battery_state'] = t, np.column_stack(
-        [battery[:, 0], before + _drawn(t, battery[:, 1])])
     t = series['command'][0]
     begin, end = t[0] + lead, t[-1]
     begin, end = _without_gaps(name, series, begin, end, p, findings, origin)
@@ -157,8 +148,7 @@ def _unusable(name, topic, cause, at_s=None):
 def _in_order(name, topic, recording, findings):
     """Finite samples in ascending order, without repeated stamps."""
     t, values = recording.times[topic], recording.values[topic]
-    needed = values[:, :1] if topic in OPTIONAL else values     # a pack may measure no current
-    fine = np.isfinite(t) & np.isfinite(needed).all(axis=1)
+    fine = np.isfinite(t) & np.isfinite(values).all(axis=1)
     if not fine.all():
         findings.append(f'{name}: {topic}: {int((~fine).sum())} messages hold no numbers')
         t, values = t[fine], values[fine]
@@ -171,21 +161,16 @@ def _in_order(name, topic, recording, findings):
     return t, values[first]
 
 
-def _drawn_until(recording, first):
-    """Charge [A h] that was drawn before the flight, whose first stamp is ``first`` (1,) [s]."""
-    t, values = recording.times['battery_state'], recording.values['battery_state']
-    fine = np.isfinite(t)
-    t, rows = np.unique(t[fine], return_index=True)
-    return np.interp(first, t, _drawn(t, values[fine][rows, 1]))[0] if len(first) else 0.0
-
-
-def _drawn(t, current):
-    """Charge (N,) drawn since the first message [A h], whichever sign discharging has."""
-    known = np.isfinite(current)
-    if known.sum() < 2:
-        return np.zeros(len(t))
-    current = np.interp(t, t[known], current[known])
-    return np.abs(cumulative_trapezoid(current, t, initial=0)) / 3600
+def _with_charge(recording):
+    """The charge drawn since the first message [A h] in place of the current of either sign."""
+    t, (voltage, current) = recording.times['battery_state'], recording.values['battery_state'].T
+    known = np.isfinite(t) & np.isfinite(current)
+    at, rows = np.unique(t[known], return_index=True)
+    drawn = np.zeros(len(t))
+    if len(at) > 1:
+        charge = cumulative_trapezoid(current[known][rows], at, initial=0) / 3600
+        drawn = np.interp(t, at, np.abs(charge))
+    return changed(recording, 'battery_state', values=np.column_stack([voltage, drawn]))
 
 
 def _without_gaps(name, series, begin, end, p, findings, origin):
@@ -241,12 +226,11 @@ def check_apart(runs: list[Path]) -> None:
         files = [run] if run.suffix.lower() in TABLES else bag_files(run)
         if not all(file.is_file() for file in files):
             continue        # reading it raises the error
-        size = tuple(file.stat().st_size for file in files)
-        digest = tuple(_digest(file) for file in files)
-        if (size, digest) in known:
-            raise ParameterError(f'{known[size, digest]} and {run}: the same recording twice; '
+        digest = tuple(hashlib.sha256(file.read_bytes()).hexdigest() for file in files)
+        if digest in known:
+            raise ParameterError(f'{known[digest]} and {run}: the same recording twice; '
                                  'expected different flights, each once')
-        known[size, digest] = run
+        known[digest] = run
 
 
 def check_flights(runs: list[Path], flights: list[Flight], same: float) -> None:
@@ -265,9 +249,3 @@ def check_flights(runs: list[Path], flights: list[Flight], same: float) -> None:
             if len(own & readings[j]) > same * min(len(own), len(readings[j])):
                 raise ParameterError(f'{runs[j]} and {runs[k]}: the same flight in two '
                                      'recordings; expected different flights, each once')
-
-
-def _digest(file):
-    with file.open('rb') as stream:
-        return hashlib.file_digest(stream, 'sha256').hexdigest() \
-            if hasattr(hashlib, 'file_digest') else hashlib.sha256(stream.read()).hexdigest()

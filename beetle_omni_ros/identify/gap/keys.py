@@ -36,14 +36,13 @@ class Key:
         index: index in a vector, or None.
         base: value of the robot file.
         relative: whether a deviation is the logarithm of a ratio to ``base``.
-        low: smallest deviation.
-        high: largest deviation.
         typical: typical deviation.
         smallest: smallest relevant deviation.
         groups: channel groups that depend on it.
         body: whether it is in the body equations, not in a signal.
         step: step of finite differences.
         form: whether it selects a form and is not fitted.
+        ends_at_none: whether the smallest value means no effect, as of drag or friction.
 
     """
 
@@ -53,23 +52,17 @@ class Key:
     index: int | None
     base: float
     relative: bool
-    low: float
-    high: float
     typical: float
     smallest: float
     groups: str
     body: bool = False
     step: float = 1e-3
     form: bool = False
+    ends_at_none: bool = False
 
     def value(self, deviation: float) -> float:
         """Catalogue value of a deviation."""
         return self.base * math.exp(deviation) if self.relative else self.base + deviation
-
-    @property
-    def ends_at_none(self) -> bool:
-        """Whether the smallest value means no effect, as of drag or friction."""
-        return not self.relative and self.value(self.low) == 0.0
 
 
 def number_of(robot: RobotParameters, key: str) -> float | np.ndarray:
@@ -125,14 +118,12 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
             base = base_of(spec, effects.get(name, {}).get(parameter, own))
             texts = names_of(name, parameter)
             for k, (text, value) in enumerate(zip(texts, base, strict=True)):
-                low, high = (math.log(max(b / value, spec.least)) if relative else b - value
-                             for b in (spec.low, spec.high))
                 keys[text] = Key(text, name, parameter, k if len(texts) > 1 else None,
-                                 float(value), relative, low, high,
+                                 float(value), relative,
                                  0.5 if math.isnan(spec.typical) else spec.typical,
                                  0.0 if math.isnan(spec.smallest) else spec.smallest,
-                                 groups, effect.apply is not None, spec.step,
-                                 spec.form)
+                                 groups, effect.apply is not None, spec.step, spec.form,
+                                 not relative and spec.low == 0.0)
     return keys
 
 
@@ -154,19 +145,19 @@ def extra_keys() -> dict[str, Key]:
     """Keys outside the catalogue: rotor positions, modules, servos, delays of the bus."""
     keys = {}
 
-    def add(name, index, reach, typical, groups, **more):
+    def add(name, index, typical, groups, **more):
         effect, parameter = name.split('[')[0].split('.')
         keys[name] = Key(name, effect, more.pop('parameter', parameter), index, 0.0, False,
-                         -reach, reach, typical, 0.0, groups, **more)
+                         typical, 0.0, groups, **more)
 
     for k in range(12):
-        add(f'position.offset[{k}]', k, 0.05, 0.001, 'B', body=True)
-    add('modules.share', None, 2, 0.05, 'BJ', step=0.05)
-    add('swing.ratio', None, 1, 0.1, 'J', step=0.01)
+        add(f'position.offset[{k}]', k, 0.001, 'B', body=True)
+    add('modules.share', None, 0.05, 'BJ', step=0.05)
+    add('swing.ratio', None, 0.1, 'J', step=0.01)
     for k in range(4):
-        add(f'rotor.lag[{k}]', k, 1, 0.1, 'B', step=0.02)
+        add(f'rotor.lag[{k}]', k, 0.1, 'B', step=0.02)
         for gain in ('kp', 'kd'):
-            add(f'servo.{gain}[{k}]', k, 1, 0.3, 'J', step=0.01)
+            add(f'servo.{gain}[{k}]', k, 0.3, 'J', step=0.01)
     for name in (TILT_BUS, THRUST_BUS):
-        add(name, None, 0.05, 0.005, 'BJ', parameter='delay')
+        add(name, None, 0.005, 'BJ', parameter='delay')
     return keys

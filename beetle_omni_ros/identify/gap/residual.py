@@ -15,7 +15,14 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import delays_of, Key
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.servo import simulate, targets_at, windows_at
+from beetle_omni_ros.identify.gap.servo import (
+    module_load,
+    simulate,
+    spin_load,
+    targets_at,
+    undescribed_load,
+    Windows,
+)
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import NUMPY, Servo
@@ -108,17 +115,10 @@ class FlightModel:
 
     def _joints(self, sets):
         """Encoders minus simulated servos, [(M, 4)] for each set."""
-        groups: dict[tuple, list[int]] = {}
-        for k, theta in enumerate(sets):
-            groups.setdefault(tuple(theta.get(name, 0.0) for name in SHIFTS), []).append(k)
-        residuals: list = [None] * len(sets)
         first, count = self._starts[0], self._length * len(self._starts)
-        for members in groups.values():
-            runs = self._servos([sets[k] for k in members], sets[members[0]])
-            for k, run in zip(members, runs, strict=True):
-                read = self.signals.joints(sets[k])[3][first:first + count]
-                residuals[k] = self._of_joints(read - run.reshape(-1, 4))
-        return residuals
+        return [self._of_joints(self.signals.joints(theta)[3][first:first + count]
+                                - self._servos([theta], theta)[0].reshape(-1, 4))
+                for theta in sets]
 
     def smooth_tilts(self, theta: dict[str, float]) -> None:
         """
@@ -189,7 +189,11 @@ class FlightModel:
         at = self._starts - round(p.servo_warm_up / p.grid)
         middle = edges[:, :-1] + p.servo_step / 2
         index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
-        return windows_at(s, theta, index, (tilt[at], rate[at]), s.thrust({})[0], skip), edges
+        loads = (s.thrust({})[0], module_load(s, theta), spin_load(s, theta),
+                 *undescribed_load(s, theta))
+        force, load, spin, *more = (series[index].transpose(1, 0, 2) for series in loads)
+        return Windows(tilt[at], rate[at], force, load, spin, p.servo_step, skip,
+                       round(p.grid / p.servo_step), tuple(more)), edges
 
 
 def limit_starts(key, effect, models):

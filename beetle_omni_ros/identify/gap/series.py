@@ -72,23 +72,10 @@ def low_pass(edge: float, every: int, period: float) -> LowPass:
     return LowPass(firwin(count, edge, window='hann', fs=1 / period), every, period)
 
 
-def turn(vector):
-    """(3, 3) rotation by a rotation vector [rad]."""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = np.asarray(vector, dtype=float)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    if angle < 1e-9:
-        return np.eye(3) + k
-    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * k @ k
-
-
 def matrices(q):
     """(N, 3, 3) rotations of unit quaternions (N, 4) xyzw."""
-    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                     [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                     [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
-                    ).transpose(2, 0, 1)
+    unit = q / np.linalg.norm(q, axis=1, keepdims=True)
+    return np.reshape(rotations.entries(*unit.T), (3, 3, -1)).transpose(2, 0, 1)
 
 
 def derivatives(series, edge, period):
@@ -139,15 +126,14 @@ def held_at(times, t, values, sums):
 
 def turned(quaternion, vector):
     """Quaternions (N, 4) xyzw, each followed by a rotation vector of the body [rad]."""
-    angle = np.linalg.norm(vector)
-    x2, y2, z2 = vector / angle * np.sin(angle / 2)
-    w2 = np.cos(angle / 2)
-    x, y, z, w = quaternion.T
-    return np.stack(rotations.product(x, y, z, w, x2, y2, z2, w2), axis=1)
+    return np.stack(rotations.product(*quaternion.T, *rotations.exp_parts(*vector)), axis=1)
 
 
 def aligned(quaternion):
-    """Quaternions (N, 4) with continuous signs."""
-    sign = np.sign((quaternion[1:] * quaternion[:-1]).sum(axis=1))
-    sign[sign == 0] = 1
-    return quaternion * np.concatenate([[1.0], np.cumprod(sign)])[:, None]
+    """Quaternions (N, 4) with continuous signs; rows without numbers stay."""
+    out = np.array(quaternion)
+    there = np.flatnonzero(np.isfinite(out).all(axis=1))
+    flips = np.sign((out[there[1:]] * out[there[:-1]]).sum(axis=1))
+    flips[flips == 0] = 1
+    out[there] *= np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+    return out

@@ -48,28 +48,6 @@ class Windows:
     undescribed: tuple[np.ndarray, ...] = ()
 
 
-def windows_at(signals: Signals, theta: dict[str, float], index: np.ndarray,
-               start: tuple[np.ndarray, np.ndarray], thrust: np.ndarray, skip: int) -> Windows:
-    """
-    Windows with the measured loads.
-
-    Args:
-        signals: measured states.
-        theta: deviations by key name.
-        index: (W, K) row of the common grid of each step.
-        start: ``start`` and ``start_rate`` of the windows.
-        thrust: (N, 4) thrusts on the common grid [N].
-        skip: steps of warm-up.
-
-    """
-    p = signals.p
-    loads = (thrust, module_load(signals, theta), spin_load(signals, theta),
-             *undescribed_load(signals, theta))
-    force, load, spin, *undescribed = (series[index].transpose(1, 0, 2) for series in loads)
-    return Windows(*start, force, load, spin, p.servo_step, skip, round(p.grid / p.servo_step),
-                   tuple(undescribed))
-
-
 def targets_at(signals: Signals, theta: dict[str, float], edges: np.ndarray) -> np.ndarray:
     """(K, W, 4) mean delayed commands [rad] between the steps ``edges`` (W, K + 1) [s]."""
     means = signals.tilt_targets(edges.ravel(), signals.delays(theta)[0])

@@ -5,6 +5,7 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import base_of, names_of, THRUST_BUS, TILT_BUS
@@ -18,10 +19,10 @@ from beetle_omni_ros.identify.gap.series import (
     low_pass,
     matrices,
     spread,
-    turn,
     turned,
     within,
 )
+from beetle_omni_ros.identify.recording.signals import white_noise
 from beetle_omni_ros.robot.effects import CATALOGUE, ignored
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import play
@@ -81,8 +82,7 @@ class Signals:
         third = np.abs(np.diff(flight.joint, 3, axis=0))
         self.reading_noise = float(np.median(np.sqrt((np.minimum(third, np.quantile(
             third, 0.9, axis=0))**2).mean(axis=0) / 20)))
-        third = np.diff(flight.pose[:, :3], 3, axis=0)
-        self.position_noise = float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20))
+        self.position_noise = float(np.median(white_noise(flight.pose[:, :3])))
         self.model_tilts: np.ndarray | None = None
 
     def use_model_tilts(self, model_tilts: np.ndarray) -> None:
@@ -130,7 +130,7 @@ class Signals:
             force, rate, turning = self._own_imu
             force, rate = force - values[:3], rate - values[3:6]
             if values[6:9].any():
-                rotation = turn(values[6:9]).T
+                rotation = Rotation.from_rotvec(values[6:9]).as_matrix().T
                 force, rate, turning = force @ rotation, rate @ rotation, turning @ rotation
             if values[9:].any():
                 lever = values[9:]

@@ -6,9 +6,9 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
 from beetle_omni_ros.identify.gap.series import low_pass
-from beetle_omni_ros.identify.recording.clocks import begin_of, clock_damages, lag_damage
+from beetle_omni_ros.identify.recording.clocks import clock_damages, lag_damage
 from beetle_omni_ros.identify.recording.damage import changed, Damage
-from beetle_omni_ros.identify.recording.limits import RecordingLimits, shipped
+from beetle_omni_ros.identify.recording.limits import shipped
 from beetle_omni_ros.identify.recording.readings import reading_damages, sensor_damages
 from beetle_omni_ros.identify.recording.relations import Mistake, mistakes, Relation, RELATIONS
 from beetle_omni_ros.identify.recording.signals import Signals, signals_of
@@ -17,8 +17,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 MOST_REPAIRS = 6        # successive; a repair can reveal another damage
 
 
-def damages(recording: Recording, robot: RobotParameters, begin: float | None = None,
-            limits: RecordingLimits | None = None) -> list[Damage]:
+def checked(recording: Recording, robot: RobotParameters, begin: float, fix: bool = False
+            ) -> tuple[Recording, list[str], list[Damage]]:
     """
     Check the flown part of a recording with every topic of ``NEEDED`` by redundant signals.
 
@@ -28,53 +28,38 @@ def damages(recording: Recording, robot: RobotParameters, begin: float | None = 
         recording: the flown part.
         robot: robot file.
         begin: first stamp of the whole recording's IMU [s], the origin of stated times.
-        limits: limits of a valid recording.
+        fix: whether certain corrections are applied until none is left.
 
     Returns:
-        damages of the most fundamental kind only, because jumping values and wrong clocks hide
-        wrong units and axes. Empty for a valid recording.
-
-    """
-    limits = limits or shipped()
-    begin = begin_of(recording) if begin is None else begin
-    if min(len(recording.times[topic]) for topic in NEEDED) < 2:
-        return []
-    with np.errstate(all='ignore'):
-        found = _damages(recording, robot, limits)
-    return [replace(d, at_s=None if d.at_s is None else max(0.0, float(d.at_s) - begin))
-            for d in found]
-
-
-def _damages(recording, robot, limits):
-    found = clock_damages(recording, limits)
-    found += reading_damages(recording, limits, {damage.topic for damage in found})
-    signals = None if found else signals_of(recording, robot, limits)
-    if signals is None:
-        return found or sensor_damages(recording, limits)
-    found = [damage for relation in RELATIONS.values() if relation.lag
-             if (damage := lag_damage(recording.name, relation, signals, limits))]
-    comparison = Comparison(recording.name, signals, limits)
-    return found or comparison.explained() or sensor_damages(recording, limits) \
-        or comparison.unexplained()
-
-
-def repaired(recording: Recording, robot: RobotParameters, begin: float | None = None,
-             limits: RecordingLimits | None = None) -> tuple[Recording, list[str], list[Damage]]:
-    """
-    Apply certain corrections until none is left; see :func:`damages`.
-
-    Returns:
-        corrected recording, descriptions of the corrections, remaining damages.
+        recording, descriptions of the corrections, and damages that are left: of the most
+        fundamental kind only, because jumping values and wrong clocks hide wrong units and axes.
 
     """
     done: list[str] = []
-    found = damages(recording, robot, begin, limits)
-    while len(done) < MOST_REPAIRS and (certain := [(d, d.repair) for d in found if d.repair]):
+    while True:
+        with np.errstate(all='ignore'):
+            found = [replace(d, at_s=None if d.at_s is None else max(0.0, float(d.at_s) - begin))
+                     for d in _damages(recording, robot)]
+        certain = [(d, d.repair) for d in found if d.repair and fix]
+        if not certain or len(done) == MOST_REPAIRS:
+            return recording, done, found
         damage, repair = certain[0]
         recording = repair(recording)
         done.append(f'{damage.text}; corrected: {damage.fix}')
-        found = damages(recording, robot, begin, limits)
-    return recording, done, found
+
+
+def _damages(recording, robot):
+    if min(len(recording.times[topic]) for topic in NEEDED) < 2:
+        return []
+    found = clock_damages(recording)
+    found += reading_damages(recording, {damage.topic for damage in found})
+    signals = None if found else signals_of(recording, robot)
+    if signals is None:
+        return found or sensor_damages(recording)
+    found = [damage for relation in RELATIONS.values() if relation.lag
+             if (damage := lag_damage(recording.name, relation, signals))]
+    comparison = Comparison(recording.name, signals)
+    return found or comparison.explained() or sensor_damages(recording) or comparison.unexplained()
 
 
 @dataclass
@@ -145,12 +130,11 @@ class Comparison:
     Args:
         name: name of the recording.
         signals: its signals.
-        limits: limits of a valid recording.
 
     """
 
-    def __init__(self, name: str, signals: Signals, limits: RecordingLimits):
-        self.name, self.signals, self.limits = name, signals, limits
+    def __init__(self, name: str, signals: Signals):
+        self.name, self.signals, self.limits = name, signals, (limits := shipped())
         period = float(np.diff(signals.t[:2])[0])
         self.kernel = low_pass(limits.edge, 2, period)
         self.centres = self.kernel.centres(len(signals.t))

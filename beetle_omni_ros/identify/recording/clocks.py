@@ -11,7 +11,7 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
 from beetle_omni_ros.identify.recording.damage import changed, Damage, IMU
-from beetle_omni_ros.identify.recording.limits import RecordingLimits
+from beetle_omni_ros.identify.recording.limits import shipped
 from beetle_omni_ros.identify.recording.relations import Relation
 from beetle_omni_ros.identify.recording.signals import Signals
 
@@ -23,19 +23,19 @@ def begin_of(recording: Recording) -> float:
     return float(recording.times[IMU][0]) if len(recording.times[IMU]) else 0.0
 
 
-def clock_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
+def clock_damages(recording: Recording) -> list[Damage]:
     """Damages by stamps alone, at most one for each topic."""
-    ages = relative_ages(recording, limits)
-    found = (_advance(recording, topic, limits) or _age(recording, topic, ages, limits)
-             or _order(recording, topic, limits) for topic in NEEDED)
+    ages = relative_ages(recording)
+    found = (_advance(recording, topic) or _age(recording, topic, ages)
+             or _order(recording, topic) for topic in NEEDED)
     return [damage for damage in found if damage]
 
 
-def _advance(recording, topic, limits):
+def _advance(recording, topic):
     """Stamps that do not advance, or are in another unit."""
-    steps, (low, high) = np.diff(recording.times[topic]), limits.period
+    steps, (low, high) = np.diff(recording.times[topic]), shipped().period
     ahead = steps[steps > 0]
-    if len(ahead) < limits.few * len(steps):
+    if len(ahead) < shipped().few * len(steps):
         return Damage(recording.name, topic, f'{len(steps) - len(ahead)} of {len(steps)} stamps '
                       f'do not advance (first stamp {recording.times[topic][0]:.3f} s)')
     period = float(np.median(ahead))
@@ -44,29 +44,28 @@ def _advance(recording, topic, limits):
         'another unit taken for seconds, such as milliseconds or nanoseconds?')
 
 
-def _order(recording, topic, limits):
+def _order(recording, topic):
     """Stamps that go back far, or occur twice with other values."""
     t, steps = recording.times[topic], np.diff(recording.times[topic])
-    if steps.min() < -limits.period[1]:
+    if steps.min() < -shipped().period[1]:
         return Damage(recording.name, topic, f'the clock goes back by {-steps.min():.2f} s',
                       t[np.argmin(steps)])
     order = np.argsort(t, kind='stable')
     rows = recording.values[topic][order]
     twice = (np.diff(t[order]) <= 0) & (rows[1:] != rows[:-1]).any(axis=1)
-    return None if twice.mean() <= limits.few else Damage(
+    return None if twice.mean() <= shipped().few else Damage(
         recording.name, topic, f'{twice.sum()} of {len(t)} stamps occur twice with other values: '
         'two sources publish on one topic', t[order][np.argmax(twice)])
 
 
-def relative_ages(recording: Recording,
-                  limits: RecordingLimits) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def relative_ages(recording: Recording) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Topic -> times of recording (n,) [s], and ages (n,) relative to the other topics [s]."""
     known = {topic: recording.received[topic] for topic in NEEDED
              if len(recording.received.get(topic, ())) == len(recording.times[topic]) > 1}
     if len(known) < 3:
         return {}
     edges = np.arange(max(r.min() for r in known.values()), min(r.max() for r in known.values()),
-                      limits.bin)
+                      shipped().bin)
     medians, result = {}, {}
     for topic, received in known.items():
         age, cuts = received - recording.times[topic], np.searchsorted(received, edges)
@@ -78,17 +77,17 @@ def relative_ages(recording: Recording,
     return result
 
 
-def _age(recording, topic, ages, limits):
+def _age(recording, topic, ages):
     """Offset, step or drift of a topic's clock against the times of recording."""
     at, lags = ages.get(topic, ((), ()))
-    judged = judge(at, lags, limits.clock_offset, limits.clock_step, limits)
+    judged = judge(at, lags, shipped().clock_offset, shipped().clock_step)
     if not judged:
         return None
     cause, moment, late_at = judged
     t, received = recording.times[topic], recording.received[topic]
     late = late_at(received)
     if moment is not None:      # the message at the step
-        near = np.flatnonzero(np.abs(received - moment) < 2 * limits.bin)
+        near = np.flatnonzero(np.abs(received - moment) < 2 * shipped().bin)
         k = near[np.argmax(np.abs(np.diff((received - t)[near])))] + 1
         moment, late = t[k], np.where(np.arange(len(t)) < k, late[0], late[-1])
     return Damage(recording.name, topic, f'the clock {cause}, against the other topics recorded '
@@ -96,18 +95,16 @@ def _age(recording, topic, ages, limits):
                   fix='shift the stamps', repair=lambda r: changed(r, topic, times=t + late))
 
 
-def lag_damage(name: str, relation: Relation, signals: Signals,
-               limits: RecordingLimits) -> Damage | None:
+def lag_damage(name: str, relation: Relation, signals: Signals) -> Damage | None:
     """A lag of two motions that is out of range, steps or drifts."""
     late, early = (np.linalg.norm(x, axis=1) for x in relation.pair(signals))
-    at, lags = window_lags(signals.t, late, early, limits, signals.silent)
-    judged = judge(at, lags, getattr(limits, relation.lag), limits.lag_step, limits)
+    at, lags = window_lags(signals.t, late, early, signals.silent)
+    judged = judge(at, lags, getattr(shipped(), relation.lag), shipped().lag_step)
     return Damage(name, relation.late, f'the clock of {relation.late} or of {relation.early} '
                   f'{judged[0]}, by {relation.words}', judged[1]) if judged else None
 
 
-def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray, least: float,
-          limits: RecordingLimits) -> list | None:
+def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray, least: float) -> list | None:
     """
     Whether lags (n,) [s] at times (n,) are out of range, step or drift; None if they are valid.
 
@@ -136,7 +133,7 @@ def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray, least: float,
     rests = [np.abs(lags - late(at)).sum() for *_, late in models]
     change, *result = models[int(np.argmin(rests))]
     if abs(change) > least \
-            and usual - min(rests) > limits.prior * max(min(rests) / n, least / 10):
+            and usual - min(rests) > shipped().prior * max(min(rests) / n, least / 10):
         return result
     if allowed[0] <= middle <= allowed[1]:
         return None
@@ -144,8 +141,8 @@ def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray, least: float,
             f'{allowed[0]:g} to {allowed[1]:g} s', None, lambda t: np.full(len(t), middle)]
 
 
-def window_lags(t: np.ndarray, late: np.ndarray, early: np.ndarray, limits: RecordingLimits,
-                gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def window_lags(t: np.ndarray, late: np.ndarray, early: np.ndarray, gaps: np.ndarray
+                ) -> tuple[np.ndarray, np.ndarray]:
     """
     Time shifts between two similar series, by windows.
 
@@ -153,14 +150,13 @@ def window_lags(t: np.ndarray, late: np.ndarray, early: np.ndarray, limits: Reco
         t: (N,) times [s].
         late: (N,) delayed magnitude.
         early: (N,) leading magnitude.
-        limits: window, largest shift and least evidence.
         gaps: (N,) mask of times in a gap, whose windows are ignored.
 
     Returns:
         times (W,) of the motion in these windows [s], and shifts (W,) [s].
 
     """
-    period, at, lags = float(t[1] - t[0]), [-np.inf], list[float]()
+    limits, period, at, lags = shipped(), float(t[1] - t[0]), [-np.inf], list[float]()
     length, reach, apart = (round(x / period) for x in (
         limits.window, limits.lag_reach, 1 / limits.edge))
     for first in range(0, len(t) - length + 1, length // OVERLAP):

@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter
 from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.series import matrices
 from beetle_omni_ros.identify.recording.damage import changed, COMMAND, Damage, IMU, JOINTS, POSE
-from beetle_omni_ros.identify.recording.limits import RecordingLimits
+from beetle_omni_ros.identify.recording.limits import shipped
 from beetle_omni_ros.identify.recording.signals import series_of, white_noise
 
 NEIGHBOURS = 7          # readings of a running median
@@ -21,21 +21,20 @@ SENSORS = (
     (JOINTS, 0, [f'gimbal{k}' for k in range(1, 5)], 'rad'))
 
 
-def reading_damages(recording: Recording, limits: RecordingLimits,
-                    unclocked: Container[str] = ()) -> list[Damage]:
+def reading_damages(recording: Recording, unclocked: Container[str] = ()) -> list[Damage]:
     """
     Damages in the values of single topics in any unit, at most one for each topic.
 
     Topics with wrong stamps (``unclocked``) are ignored.
     """
     return _first(sensor.lost() or sensor.repeated() or sensor.outliers() for sensor in (
-        _Sensor(recording, k, limits) for k, (topic, *_) in enumerate(SENSORS)
+        _Sensor(recording, k) for k, (topic, *_) in enumerate(SENSORS)
         if topic != JOINTS and topic not in unclocked))
 
 
-def sensor_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
+def sensor_damages(recording: Recording) -> list[Damage]:
     """Stuck encoders and sensors with unusually large noise, whose units must be correct."""
-    sensors = [_Sensor(recording, k, limits) for k in range(len(SENSORS))]
+    sensors = [_Sensor(recording, k) for k in range(len(SENSORS))]
     return _first([sensors[-1].stuck(), sensors[-1].outliers(), *(s.noise() for s in sensors)])
 
 
@@ -50,8 +49,8 @@ def _first(found):
 class _Sensor:
     """Finite readings of one sensor in the order of their stamps, see ``SENSORS``."""
 
-    def __init__(self, recording, k, limits):
-        self.recording, self.limits, self.scatter = recording, limits, limits.scatter[k]
+    def __init__(self, recording, k):
+        self.recording, self.limits, self.scatter = recording, shipped(), shipped().scatter[k]
         self.topic, first, self.names, self.unit = SENSORS[k]
         self.t, everything = series_of(recording, self.topic)
         self.same = (np.diff(everything, axis=0) == 0).all(axis=1)

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.series import aligned, low_pass, matrices
 from beetle_omni_ros.identify.recording.damage import COMMAND, IMU, JOINTS, POSE
-from beetle_omni_ros.identify.recording.limits import RecordingLimits
+from beetle_omni_ros.identify.recording.limits import shipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 GRAVITY = 'gravity'     # [m/s^2] that the accelerometer measures
@@ -68,9 +68,9 @@ class Signals:
         return self.data[IMU][0, :, :3], force / self.robot.mass
 
 
-def signals_of(recording: Recording, robot: RobotParameters,
-               limits: RecordingLimits) -> Signals | None:
+def signals_of(recording: Recording, robot: RobotParameters) -> Signals | None:
     """Smooth all topics with the same filter; None if they have too little time in common."""
+    limits = shipped()
     series = {topic: series_of(recording, topic) for topic in (IMU, POSE, JOINTS, COMMAND)}
     if min(len(t) for t, _ in series.values()) < 2:
         return None
