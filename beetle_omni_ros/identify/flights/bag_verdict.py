@@ -59,7 +59,8 @@ def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapP
     if len(models) > 1:
         spreads |= {n: replace(spreads[n], flight=0.0) for n in varying}
     engine = Engine(models, names, spreads, entries, bounds, far, alpha, varying=varying,
-                    kept=frozenset(kept),
+                    kept=frozenset(kept), inert=[n for n in names if n in keys
+                                                 and keys[n].effect in ('mass', 'inertia')],
                     curved=frozenset({*starts, *tangents}))
     solution = engine.run()
     for model in others:

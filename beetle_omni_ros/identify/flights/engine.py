@@ -29,6 +29,8 @@ PAIRED = 20             # entries whose pairs are all weighed; others follow fro
 FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
 RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
 GROUPS = (0.0, 0.5, 2.0)    # [Hz] lower ends of the groups of bands of the test of constancy
+TURN = 1 / (2 * np.pi * GROUPS[-1])     # [s] one radian there: a typical answer of feedback has a
+                                        # part in quadrature as large as the part in phase
 
 
 class Engine:
@@ -45,6 +47,7 @@ class Engine:
         far: keys whose deviation may be many times typical.
         alpha: accepted probability of a false alarm.
         progress: gets a short text at each stage.
+        inert: keys of masses and inertias, by which feedback is explained.
 
     """
 
@@ -53,10 +56,11 @@ class Engine:
                  far: frozenset[str] = frozenset(), alpha: float = 0.05,
                  progress: Callable[[str], None] = lambda text: None,
                  curved: frozenset[str] = frozenset(), varying: dict[str, float] | None = None,
-                 kept: frozenset[str] = frozenset()):
+                 kept: frozenset[str] = frozenset(), inert: Sequence[str] = ()):
         self.flights, self.names, self.entries = list(flights), list(names), list(entries)
         self.real = len(names)
-        spreads = {**spreads, **self._repeat(spreads, varying or {})}
+        spreads = {**spreads, **self._repeat(spreads, varying or {}),
+                   **self._quadrature(spreads, inert)}
         names = self.names
         self.narrow, self.typical, self.flight = (np.array(
             [getattr(spreads[name], kind) for name in names])
@@ -100,6 +104,18 @@ class Engine:
                     more[own[-1]] = Spread(SAME * varying[key], varying[key], 0.0)
             self.entries.append(replace(entry, keys=tuple(own), varying=True))
         return more
+
+    def _quadrature(self, spreads, inert):
+        """
+        Keys of the answer of feedback, in quadrature to masses and inertias.
+
+        In a band, feedback is a complex factor of the measured accelerations. Its real part looks
+        like a mass or an inertia, its imaginary part like a delay of the IMU.
+        """
+        self.lags = {self.names.index(key): len(self.names) + k for k, key in enumerate(inert)}
+        self.names += [f'{key} late' for key in inert]
+        return {f'{key} late': Spread(1e-3 * spreads[key].narrow * TURN,
+                                      spreads[key].typical * TURN, 0.0) for key in inert}
 
     def _at(self, k, theta):
         """(R,) values of the real keys in flight k at all keys (K,)."""
@@ -200,6 +216,8 @@ class Engine:
             for at_flight, key, column in self.repeats:
                 if fitted and at_flight == k:
                     slopes[:, :, column] = linear.slopes[:, :, key]
+            for key, column in self.lags.items():
+                slopes[:, :, column] = np.gradient(linear.slopes[:, :, key], flight.period, axis=0)
             slopes[:, :, self.known:] = -phi.reshape(*residual.shape, -1)
             floor = np.array([FLOORS[c.split('_')[0]] for c in flight.channels])
             found = spectrum(residual, slopes, flight.mask, flight.period, floor,
@@ -330,7 +348,8 @@ class Engine:
         bands = self._bands_of_groups()
         copies = int(bands.max()) + 1
         own = np.array(self.indices((entry,)) if entry is not None else [], dtype=int)
-        free = np.array(self.indices(tuple(banned)), dtype=int)
+        free = self.indices(tuple(banned))
+        free = np.array([*free, *(self.lags[k] for k in free if k in self.lags)], dtype=int)
         keys = np.concatenate([own, free])
         equations = normal(spectra, self.names, self.flight, keys, bands,
                            self.narrow[self.known:])
