@@ -79,7 +79,8 @@ class Case:
         """Verdicts that are right without a name."""
         if self.damage:
             return DAMAGED[self.damage][1]
-        return {'none': ('no_gap',), 'outside': ('unknown',), 'undecidable': ('not_decidable',),
+        none = ('no_gap', *(('not_decidable',) if self.course == 'hover' else ()))
+        return {'none': none, 'outside': ('unknown',), 'undecidable': ('not_decidable',),
                 'short': ('not_decidable', 'no_gap', 'bad_data')}.get(self.kind, ())
 
     def allowed(self) -> tuple[str, ...]:
@@ -165,10 +166,11 @@ def _single(settings, difficulty, k, rng, age):
 
 
 def _none(settings, difficulty, k, rng, age):
-    harder = {'noise': 2.0 if k % 4 == 3 else 1.0,
-              'course': 'lemniscate' if k % 5 == 4 else 'poses'}
-    if difficulty == 'hard':  # each hardship also alone
-        harder |= [{}, {'multibody': False}, {'gust': False}, {'tolerance': False}][k % 4]
+    harder = {'noise': 2.0 if k % 3 == 2 else 1.0,
+              'course': ('poses', 'lemniscate', 'poses', 'hover')[k % 4]}
+    if difficulty == 'hard':    # half calm; now and then without one of the other hardships
+        harder |= {'gust': k // 4 % 2 == 0, 'conditions': ('published', 'nominal')[k // 8 % 2],
+                   'multibody': k % 5 != 4, 'tolerance': k % 7 != 6}
     return _base(settings, difficulty, k, rng, age, 'none', **harder)
 
 
