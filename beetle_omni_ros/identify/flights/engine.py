@@ -348,8 +348,8 @@ class Engine:
         bands = self._bands_of_groups()
         copies = int(bands.max()) + 1
         own = np.array(self.indices((entry,)) if entry is not None else [], dtype=int)
-        free = self.indices(tuple(banned))
-        free = np.array([*free, *(self.lags[k] for k in free if k in self.lags)], dtype=int)
+        fed = self.indices(tuple(banned))
+        free = np.array([*fed, *(self.lags[k] for k in fed if k in self.lags)], dtype=int)
         keys = np.concatenate([own, free])
         equations = normal(spectra, self.names, self.flight, keys, bands,
                            self.narrow[self.known:])
