@@ -63,7 +63,8 @@ def judge(label: dict, run: dict) -> dict:
         'multibody': case['multibody'], 'damage': case['damage'], 'course': case['course'],
         'truth': [t['name'] for t in truths], 'shapes': [t['shape'] for t in truths],
         'sizes': [t['size'] for t in truths],
-        'verdict': verdict, 'named': named, 'wrong': [e['names'] for e in wrong],
+        'verdict': verdict, 'chance': answer.get('false_alarm_probability'),
+        'named': named, 'wrong': [e['names'] for e in wrong],
         'exact': [e is not None and len(e['names']) == 1 for e in matches],
         'answers': [e['names'] for e in found],
         'accepted_verdict': verdict in label['accept'],
@@ -103,7 +104,8 @@ def _right(judged, label):
     if kind == 'pairs':
         return all(judged['named'])
     if kind == 'none':
-        return not judged['wrong'] and judged['verdict'] in ('no_gap', 'named', 'named_set')
+        return not judged['wrong'] and (
+            judged['accepted_verdict'] or judged['verdict'] in ('named', 'named_set'))
     if kind == 'undecidable':
         by_name = label.get('name_is_right') and all(judged['named']) and not judged['wrong']
         return judged['accepted_verdict'] or judged['set_right'] or by_name

@@ -40,6 +40,9 @@ def criteria(judged: list[dict], difficulty: str) -> list[dict]:
         ('single: named exactly', share([all(j['exact']) for j in singles]), '>=', 0.80),
         ('single: any wrong name', share([bool(j['wrong']) for j in singles]), '<=', 0.05),
         ('none: false alarm', share([bool(j['wrong']) for j in none]), '<=', 0.05),
+        *((f'none: false_alarm_probability of at most {alpha}', share(
+            [j['chance'] <= alpha for j in none if j.get('chance') is not None]), '<=', alpha)
+          for alpha in (0.05, 0.2)),
         ('none: says so', share([j['right'] for j in none]), '>=', 0.95),
         ('pair: both named', share([all(j['named']) for j in pairs]), '>=', 0.60),
         ('pair: at least one named', share([any(j['named']) for j in pairs]), '>=', 0.90),
