@@ -59,7 +59,8 @@ class Case:
 
     def accept(self) -> tuple[str, ...]:
         """Verdicts that are right without a name."""
-        return {'none': ('no_gap',), 'outside': ('unknown',),
+        none = ('no_gap', *(('not_decidable',) if self.course == 'hover' else ()))
+        return {'none': none, 'outside': ('unknown',),
                 'undecidable': ('not_decidable',)}.get(self.kind, ())
 
     def allowed(self) -> tuple[str, ...]:
@@ -122,10 +123,12 @@ def _single(settings, difficulty, k, rng):
 
 
 def _none(settings, difficulty, k, rng):
-    hard = [{}, {'multibody': False}, {'gust': False}, {'tolerance': False}][k % 4] \
-        if difficulty == 'hard' else {}      # each hardship also alone
-    return {'noise': 2.0 if k % 4 == 3 else 1.0,
-            'course': 'lemniscate' if k % 5 == 4 else 'poses', **hard}
+    harder = {'noise': 2.0 if k % 3 == 2 else 1.0,
+              'course': ('poses', 'lemniscate', 'poses', 'hover')[k % 4]}
+    if difficulty == 'hard':    # half calm; now and then without one of the other hardships
+        harder |= {'gust': k // 4 % 2 == 0, 'conditions': ('published', 'nominal')[k // 8 % 2],
+                   'multibody': k % 5 != 4, 'tolerance': k % 7 != 6}
+    return harder
 
 
 def _pair(settings, difficulty, k, rng):

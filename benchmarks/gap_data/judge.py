@@ -34,6 +34,7 @@ def judge(label: dict, run: dict) -> dict:
     used = {id(effect) for effect in matches if effect is not None}
     judged = {
         **label['case'], 'truth': truths, 'verdict': answer.get('verdict', 'nothing'),
+        'chance': answer.get('false_alarm_probability'),
         'answers': [effect['names'] for effect in found],
         'named': [effect is not None for effect in matches],
         'wrong': [effect['names'] for effect in found if id(effect) not in used
@@ -63,7 +64,8 @@ def _right(judged, label, found):
     if kind in ('singles', 'pairs'):
         return all(judged['named'])
     if kind == 'none':
-        return not judged['wrong'] and judged['verdict'] in ('no_gap', 'named', 'named_set')
+        return not judged['wrong'] and (
+            accepted or judged['verdict'] in ('named', 'named_set'))
     if kind == 'undecidable':
         by_name = label.get('name_is_right') and all(judged['named']) and not judged['wrong']
         by_set = any(len(e['names']) > 1 and set(e['names']) & set(label['sets'])

@@ -46,6 +46,9 @@ def criteria(judged: list[dict], difficulty: str) -> list[dict]:
          '>=', 0.97 if clean else 0.90),
         ('single: any wrong name', share([bool(j['wrong']) for j in singles]), '<=', 0.05),
         ('none: false alarm', share([bool(j['wrong']) for j in none]), '<=', 0.05),
+        *((f'none: false_alarm_probability of at most {alpha}', share(
+            [j['chance'] <= alpha for j in none if j.get('chance') is not None]), '<=', alpha)
+          for alpha in (0.05, 0.2)),
         ('none: says so', share([j['right'] for j in none]), '>=', 0.95),
         ('pair: both named', share([all(j['named']) for j in pairs]), '>=', 0.60),
         ('pair: any wrong name', share([bool(j['wrong']) for j in pairs]), '<=', 0.10),

@@ -90,7 +90,9 @@ def test_a_tolerance_with_limits_agrees_with_quadrature():
     estimate, sigma = judge._profile((0,))[1][0], judge._profile((0,))[2][0, 0]**0.5
     inside = quad(lambda x: norm.pdf(x, 0, narrow) * norm.pdf(estimate, x, sigma), low, high)[0] \
         / (norm.cdf(high, 0, narrow) - norm.cdf(low, 0, narrow))
-    free = norm.pdf(estimate, 0, np.hypot(np.hypot(narrow, 0.02), sigma))
+    wide = np.hypot(narrow, 0.02)       # only the lower limit is physical
+    free = quad(lambda x: norm.pdf(x, 0, wide) * norm.pdf(estimate, x, sigma), low, 0.2,
+                points=[0, estimate], limit=200)[0] / norm.sf(low, 0, wide)
     assert judge.gain((0,), ()) == pytest.approx(np.log(free / inside), abs=1e-3)
     assert judge.posterior(()).theta[0] < high + 3 * sigma
 

@@ -18,8 +18,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 P, ROBOT = GapParameters.load(), RobotParameters.load()
 
 
-def flights(folder, seed, *effects, **more):
-    case = Case('singles' if effects else 'none', 'hard', seed, effects, duration=40.0,
+def flights(folder, seed, *effects, duration=40.0, **more):
+    case = Case('singles' if effects else 'none', 'hard', seed, effects, duration=duration,
                 gust=True, multibody=True, tolerance=True, **more)
     made = make_case(case, folder / 'flights', folder / 'sealed')
     return [load_flight(made / name, ROBOT, P) for name in ('fit_1', 'fit_2', 'holdout_1')]
@@ -29,9 +29,20 @@ def names(result):
     return [name for effect in result['effects'] for name in effect['names']]
 
 
-def test_feedback_of_gusts_in_a_smooth_task_is_no_effect(tmp_path):
-    result = judged(flights(tmp_path, 5, course='lemniscate')[:2], [], ROBOT, P)
+@pytest.mark.parametrize('seed, more', [
+    (5, {}), (952385194, {'conditions': 'published', 'duration': 60.0})])
+def test_feedback_of_gusts_in_a_smooth_task_is_no_effect(tmp_path, seed, more):
+    result = judged(flights(tmp_path, seed, course='lemniscate', **more)[:2], [], ROBOT, P)
     assert names(result) == [] and result['false_alarm_probability'] > 0.05
+
+
+def test_a_late_mocap_is_named_although_it_is_noisy(tmp_path):
+    late = flights(tmp_path, 5, ('mocap_time_offset', 0.015, 'plain'), course='lemniscate',
+                   conditions='published')[:2]
+    result = judged(late, [], ROBOT, P)
+    assert names(result) == ['mocap_time_offset']
+    low, high = result['effects'][0]['parameters']['delay']['interval']
+    assert low - 0.002 < 0.015 < high
 
 
 def test_a_hidden_effect_is_named_though_the_sensors_differ_from_flight_to_flight(tmp_path):
@@ -60,9 +71,11 @@ def test_gains_loads_and_inertia_of_a_servo_have_one_common_factor(tmp_path):
 
 def test_slopes_agree_with_differences_of_the_residual(tmp_path):
     keys = {**all_keys(ROBOT), **extra_keys()}
-    made = BagFlight(flights(tmp_path, 7)[0], ROBOT, BodyModel(ROBOT, keys, (0.0, 0.0)), keys, P)
+    # without noise, which the slopes must not explain
+    made = BagFlight(flights(tmp_path, 7, noise=0.0)[0], ROBOT,
+                     BodyModel(ROBOT, keys, (0.0, 0.0)), keys, P)
     some = ['mass.mass', 'imu_misalignment.rotation[1]', 'mocap_time_offset.delay',
-            'joint_command_latency.delay', 'rotor_lag.time_constant']
+            'imu_filter_lag.delay', 'joint_command_latency.delay', 'rotor_lag.time_constant']
     linear = made.linear({}, some)
     for k, name in enumerate(some):
         step = 0.3 * keys[name].smallest

@@ -16,6 +16,7 @@ import numpy as np
 
 from beetle_omni_ros.identify.flights.residual import Linear
 from beetle_omni_ros.identify.flights.spectrum import blocks_of
+from beetle_omni_ros.identify.gap.keys import delays_of
 from beetle_omni_ros.identify.gap.residual import BOTH_SIDES, CHANNELS, FlightModel
 from beetle_omni_ros.identify.gap.series import low_pass, matrices, THIN, within
 
@@ -25,6 +26,8 @@ POSES = 8.0             # [Hz] the same of MoCap, whose noise grows with the squ
 # [Hz] largest frequency of each group: above 8 Hz the filters of readings and tilts differ, and a
 # fit takes the difference for a larger mass of the tilting modules
 FASTEST = {'B': 8.0, 'A': POSES, 'W': POSES, 'J': WIDEST}
+# Time shift of a pose of MoCap for each second of delay of these sensors.
+POSE_SHIFTS = dict.fromkeys(delays_of('imu'), -1.0) | dict.fromkeys(delays_of('mocap'), 1.0)
 
 
 class BagFlight(FlightModel):
@@ -118,6 +121,9 @@ class BagFlight(FlightModel):
         for name in names:
             key = self.keys[name]
             groups = '' if key.body else key.groups.replace('J', '')
+            if name in POSE_SHIFTS:
+                groups = groups.replace('A', '').replace('W', '')
+                found[:, 6:12, where[name]] = POSE_SHIFTS[name] * self._of_pose_shift(theta)
             if groups:
                 h, here = key.step, theta.get(name, 0.0)
                 ahead = self._residual({**theta, name: here + h}, groups)
@@ -136,6 +142,18 @@ class BagFlight(FlightModel):
             elif name in where:
                 slopes[:, :, k] = found[:, :, where[name]]
         return Linear(residual, slopes, residual)
+
+    def _of_pose_shift(self, theta):
+        """
+        Derivatives (M, 6) of accelerations and rates by a time shift of the poses.
+
+        They are those of the IMU. The derivative of the poses would explain their own noise,
+        shifted in time.
+        """
+        force, _, turning = self.signals.imu(theta)
+        jerk = np.einsum('nij,nj->ni', matrices(self.signals.pose(theta)[1]),
+                         np.gradient(force, self.p.grid, axis=0))
+        return -within(self._poses, np.concatenate([jerk, turning], axis=1), 0)[self.rows]
 
     def _real(self, theta):
         """Deviations of real keys, and factor of each start that acts."""

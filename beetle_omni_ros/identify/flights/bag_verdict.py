@@ -22,6 +22,7 @@ from beetle_omni_ros.identify.gap.keys import (
 )
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.residual import limit_starts
+from beetle_omni_ros.identify.gap.signals import IMU_LAG
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -59,8 +60,7 @@ def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapP
     if len(models) > 1:
         spreads |= {n: replace(spreads[n], flight=0.0) for n in varying}
     engine = Engine(models, names, spreads, entries, bounds, far, alpha, varying=varying,
-                    kept=frozenset(kept),
-                    curved=frozenset({*starts, *tangents}))
+                    kept=frozenset(kept), clock=IMU_LAG, curved=frozenset({*starts, *tangents}))
     solution = engine.run()
     for model in others:
         model.settle(dict(zip(names, solution.theta, strict=False)))

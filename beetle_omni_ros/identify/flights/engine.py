@@ -29,6 +29,7 @@ PAIRED = 20             # entries whose pairs are all weighed; others follow fro
 FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
 RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
 GROUPS = (0.0, 0.5, 2.0)    # [Hz] lower ends of the groups of bands of the test of constancy
+TURN = 1 / (2 * np.pi * GROUPS[-1])     # [s] one radian there: the phase of an answer of feedback
 
 
 class Engine:
@@ -45,6 +46,7 @@ class Engine:
         far: keys whose deviation may be many times typical.
         alpha: accepted probability of a false alarm.
         progress: gets a short text at each stage.
+        clock: key that shifts all inputs of the body equations; '': none.
 
     """
 
@@ -53,10 +55,10 @@ class Engine:
                  far: frozenset[str] = frozenset(), alpha: float = 0.05,
                  progress: Callable[[str], None] = lambda text: None,
                  curved: frozenset[str] = frozenset(), varying: dict[str, float] | None = None,
-                 kept: frozenset[str] = frozenset()):
+                 kept: frozenset[str] = frozenset(), clock: str = ''):
         self.flights, self.names, self.entries = list(flights), list(names), list(entries)
         self.real = len(names)
-        spreads = {**spreads, **self._repeat(spreads, varying or {})}
+        spreads = self._late({**spreads, **self._repeat(spreads, varying or {})}, clock)
         names = self.names
         self.narrow, self.typical, self.flight = (np.array(
             [getattr(spreads[name], kind) for name in names])
@@ -100,6 +102,22 @@ class Engine:
                     more[own[-1]] = Spread(SAME * varying[key], varying[key], 0.0)
             self.entries.append(replace(entry, keys=tuple(own), varying=True))
         return more
+
+    def _late(self, spreads, clock):
+        """
+        Keys of the answer of feedback: forces and torques that are late, in each group of bands.
+
+        In a band, feedback is a complex factor between the residual and what the commands cause.
+        Its real part looks like a factor of thrust or mass. Its imaginary part looks like late
+        inputs of the body equations; ``clock`` is the key that shifts all of them.
+        """
+        self.late = {}      # column -> key and channels of its slopes
+        for kind in (('force', 'torque') if clock else ()):
+            own = [c for c, name in enumerate(self.flights[0].channels) if name.startswith(kind)]
+            self.late[len(self.names)] = self.names.index(clock), own
+            self.names.append(f'late {kind}')
+            spreads = spreads | {self.names[-1]: Spread(1e-3 * spreads[clock].typical, TURN, 0.0)}
+        return spreads
 
     def _at(self, k, theta):
         """(R,) values of the real keys in flight k at all keys (K,)."""
@@ -200,6 +218,8 @@ class Engine:
             for at_flight, key, column in self.repeats:
                 if fitted and at_flight == k:
                     slopes[:, :, column] = linear.slopes[:, :, key]
+            for column, (key, rows) in self.late.items():
+                slopes[:, rows, column] = linear.slopes[:, rows, key]
             slopes[:, :, self.known:] = -phi.reshape(*residual.shape, -1)
             floor = np.array([FLOORS[c.split('_')[0]] for c in flight.channels])
             found = spectrum(residual, slopes, flight.mask, flight.period, floor,
@@ -330,7 +350,7 @@ class Engine:
         bands = self._bands_of_groups()
         copies = int(bands.max()) + 1
         own = np.array(self.indices((entry,)) if entry is not None else [], dtype=int)
-        free = np.array(self.indices(tuple(banned)), dtype=int)
+        free = np.array([*self.indices(tuple(banned)), *(self.late if banned else ())], dtype=int)
         keys = np.concatenate([own, free])
         equations = normal(spectra, self.names, self.flight, keys, bands,
                            self.narrow[self.known:])

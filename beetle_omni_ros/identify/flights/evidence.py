@@ -302,16 +302,17 @@ class Judge:
         Ln of the density of an estimate, and mean and covariance of its keys within their bounds.
 
         The priors are normal and end at the bounds. The bounds of one key after the other cut the
-        posterior, which stays normal with the mean and the covariance of what remains. The limits
-        of a tolerance do not hold for a candidate.
+        posterior, which stays normal with the mean and the covariance of what remains. The upper
+        limit of a tolerance does not hold for a candidate. The lower one is physical.
         """
         if not len(c):
             return 0.0, estimate, wide
         value = _log_density(estimate, wide, prior)
         share = prior[:, None]**2 * np.linalg.inv(wide + np.diag(prior**2))
         total, mean = np.diag(prior**2) - share * prior**2, share @ estimate
-        for k in np.flatnonzero(self.bounded[c] & ~(free & self.kept[c])):
+        for k in np.flatnonzero(self.bounded[c]):
             (low, high), size = self.bounds[c[k]], float(prior[k])
+            high = inf if free[k] and self.kept[c[k]] else high
             deviation, middle = sqrt(total[k, k]), float(mean[k])
             chance, shift, left = _within((low - middle) / deviation, (high - middle) / deviation)
             value += chance - _within(low / size, high / size)[0]
