@@ -17,6 +17,7 @@ from beetle_omni_ros.sim.parameters import draw, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.sensors import Frame, Impact, Sensors, Truth
 
+STAMP_ROUNDING = 1e-6   # [s] floats of UNIX time have a resolution of 0.24 us
 FUTURE_LIMIT = 0.1  # [s] stamps further ahead come from a wrong clock and are refused
 INTACT = np.ones(4)     # wear of four propellers
 AIRBORNE_TIME = 0.3     # [s] without contact, after which a contact is a touchdown; chosen
@@ -117,9 +118,9 @@ class CommandLink:
     def update(self, now: float) -> None:
         """Set the targets that are due at ``now``; stop the rotors after the timeout."""
         tilts, thrusts = self._pending
-        while tilts and tilts[0][0] <= now + ROUNDING:
+        while tilts and tilts[0][0] <= now + STAMP_ROUNDING:
             self.tilt = tilts.popleft()[1]
-        while thrusts and thrusts[0][0] <= now + ROUNDING:
+        while thrusts and thrusts[0][0] <= now + STAMP_ROUNDING:
             self.thrust = thrusts.popleft()[1]
         if now - self._last_arrival >= self._timeout - ROUNDING:
             self.thrust = np.zeros(4)

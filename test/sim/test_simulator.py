@@ -159,3 +159,16 @@ def test_rotors_stop_when_commands_cease_and_tilts_hold():
     made.push(command(0.2), 0.2)
     made.update(0.21)
     assert made.thrust[0] == 5
+
+
+def test_a_command_acts_in_the_same_tick_whatever_the_epoch_of_the_stamps():
+    tilts = []
+    for epoch in (0.0, 1.8e9):
+        simulator, acted = Simulator(ROBOT, epoch=epoch), []
+        for k in range(60):
+            frame = simulator.step()
+            simulator.command(Command(frame.imu.stamp - epoch, np.full(4, 0.01 * k),
+                                      np.full(4, 7.0)))
+            acted.append(simulator.link.tilt[0])
+        tilts.append(acted)
+    assert tilts[0] == tilts[1] and tilts[0][-1] > 0
