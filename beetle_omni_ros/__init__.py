@@ -7,6 +7,7 @@ The functions for notebooks. Imports are delayed until a function is called::
 
     robot = bo.robot()                                    # parameters, from a file or shipped
     log = bo.simulate('nmpc', [[0, 0, 1, 90, 0, 0]])      # a flight as numpy arrays
+    loop = bo.flight('nmpc')                              # a robot in the air, to be stepped
     table = bo.evaluate([MyController, 'rl'], 'waypoints')      # metrics, and a table in print
     log = bo.read_run('runs_out/flight')                  # a recorded bag as numpy arrays
     found = bo.find_gap(['flight1', 'flight2'])           # effects that the model lacks
@@ -26,9 +27,10 @@ if TYPE_CHECKING:
 
     from beetle_omni_ros.robot.parameters import RobotParameters
     from beetle_omni_ros.runs.log import FlightLog
+    from beetle_omni_ros.stack.loop import FlightLoop
 
 __version__ = '0.1.0'
-__all__ = ['evaluate', 'find_gap', 'read_run', 'robot', 'simulate', 'trajectory']
+__all__ = ['evaluate', 'find_gap', 'flight', 'read_run', 'robot', 'simulate', 'trajectory']
 
 
 def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
@@ -64,6 +66,34 @@ def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
                seed=seed, bag=_path(bag), meta={
                    'task': flown.name, 'conditions': conditions, 'seed': seed,
                    'robot': 'params/robot.yaml' if given else str(robot), 'version': __version__})
+
+
+def flight(controller: str | Callable = 'nmpc', *,
+           robot: RobotParameters | str | Path | None = None,
+           plant: RobotParameters | str | Path | None = None, conditions: str = 'nominal',
+           seed: int = 0) -> FlightLoop:
+    """
+    Return a robot in the air with its flight stack, which the caller steps.
+
+    ``aim(target)`` publishes a target, ``step()`` simulates 5 ms, ``request('land')`` asks the
+    supervisor, ``add(component)`` connects another component. ``simulator.truth`` is the true
+    state, ``recording()`` the flight so far. Arguments are those of :func:`simulate`.
+
+    Raises:
+        ParameterError, RunError: no take-off, with a message of one line.
+
+    """
+    from beetle_omni_ros.control import registry
+    from beetle_omni_ros.runs.log import LogRecorder
+    from beetle_omni_ros.stack.loop import FlightLoop
+    believed, entry = _robot(robot), registry.find(_reference(controller))
+    recorder = LogRecorder({'controller': entry.name})
+    made = FlightLoop(believed, believed if plant is None else _robot(plant),
+                      {entry.name: entry.make(believed)}, recorder, conditions=conditions,
+                      seed=seed)
+    made.recording = recorder.log
+    made.take_off()
+    return made
 
 
 def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any = 'waypoints', *,

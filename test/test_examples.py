@@ -11,7 +11,7 @@ import pytest
 
 import beetle_omni_ros
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.robot.schema import ParameterError
 
 ROOT = Path(__file__).parents[1]
@@ -53,6 +53,17 @@ def test_an_own_trajectory_is_followed_by_both_controllers():
 def test_an_own_robot_flies_with_known_and_unknown_parameters(poses):
     printed = run('own_robot.py', poses)
     assert printed.startswith('3.4 kg') and 'unknown robot' in printed
+
+
+def test_a_flight_can_be_stepped_by_the_caller():
+    loop = beetle_omni_ros.flight('hover')
+    loop.aim(PoseTarget(np.array([0.2, 0.0, 1.2]), np.array([0, 0, 0, 1.0])))
+    end = loop.simulator.time + 4.0
+    while loop.simulator.time < end:
+        loop.step()
+    assert np.linalg.norm(loop.simulator.truth.position - [0.2, 0.0, 1.2]) < 0.05
+    log = loop.recording()
+    assert log.states[-1].controller == 'hover' and len(log.command_t) > 400
 
 
 def test_a_bag_becomes_arrays():

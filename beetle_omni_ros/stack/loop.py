@@ -220,6 +220,7 @@ class FlightLoop(Loop):
     Attributes:
         simulator, supervisor: parts of the loop.
         events: events of the supervisor, oldest first.
+        recording: returns the flight so far, if its creator keeps one.
         epoch: time of the stamps at the start of the simulation [s].
 
     """
@@ -239,6 +240,7 @@ class FlightLoop(Loop):
         self._controllers = {name: ControllerComponent(name, controller, robot)
                              for name, controller in controllers.items()}
         self._faults = ProcessFaults(self.simulator.tick)
+        self.recording: Callable[[], Any] = lambda: None
         self._given_faults, self.epoch = tuple(faults), epoch
         self._before, self._crashed = '', False     # state of the supervisor
         super().__init__(
@@ -328,7 +330,7 @@ class FlightLoop(Loop):
         return answer
 
     def aim(self, target: Target) -> None:
-        """Publish a target."""
+        """Publish a target; a pose is valid from now on if its stamp is 0."""
         self.publish('target_pose' if isinstance(target, PoseTarget) else 'target_trajectory',
                      target)
         self.deliver()
