@@ -194,18 +194,18 @@ CATALOGUE: dict[str, Effect] = {
         "m v' = F, Newton; total mass", 'any flight',
         ('thrust_coefficient', 'voltage_sag', 'wind'),
         'weigh the robot, or fly fast turns: thrust scales torques too, mass does not',
-        sets('mass'), allocated=True, plant='model'),
+        sets('mass'), allocated=True),
     'inertia': Effect(
         'body', {'inertia': EffectParameter('kg m^2', (NAN,) * 3, 1e-6, 50, 0.2, 0.05,
                                             number='inertia', tolerance='inertia')},
         "I w' = tau - w x I w, Euler", 'fast turns about every axis',
         ('rotor_lag', 'propeller_gyroscopic_torque', 'thrust_coefficient'),
-        'flips by 90 and 180 deg about each axis', sets('inertia'), plant='model'),
+        'flips by 90 and 180 deg about each axis', sets('inertia')),
     'centre_of_mass': Effect(
         'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2, 0.005, 0.0015)},
         'forces turn the body about its centre of mass, which is displaced from base_link',
         'hover in several attitudes', ('rotor_thrust_coefficient', 'module_reaction'),
-        'hover at roll 0, 90, 180 deg and pitch 90 deg', centre_of_mass, plant='model'),
+        'hover at roll 0, 90, 180 deg and pitch 90 deg', centre_of_mass),
     'module_reaction': Effect(
         'body', {'module_inertia': EffectParameter('kg m^2', 0.0, 0.0, 0.1, 1e-4, 2e-5,
                                                    step=2e-5),
@@ -215,28 +215,28 @@ CATALOGUE: dict[str, Effect] = {
         "reaction force moment (n'' + 2 w x n'); "
         'multibody section of the robot file', 'fast tilting, turned attitudes',
         ('centre_of_mass', 'inertia'), 'the same attitude with tilts turned by 180 deg',
-        module_reaction, channels='BJ', plant='model', ignored_by={
+        module_reaction, channels='BJ', ignored_by={
             'plant': 'its modules are bodies with the masses of the multibody section; without '
                      'that section it acts'}),
     'thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0, 0.05, 0.01, tolerance='thrust')},
         'f = scale f*, all rotors', 'any flight', ('mass', 'voltage_sag', 'tilt_thrust_loss'),
         'weigh the robot; flights at two states of charge', thrust_coefficient,
-        allocated=True, plant='model'),
+        allocated=True),
     'rotor_thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', (1.0,) * 4, 0.0, 2.0, 0.08, 0.015,
                                           tolerance='thrust')},
         'f_i = scale_i f*_i: damaged propeller or other speed controller',
         'hover in several attitudes', ('centre_of_mass', 'rotor_thrust_coefficient'),
         'tilted attitudes; exchange propellers 1 and 2', thrust_coefficient,
-        each='rotor', allocated=True, plant='model'),
+        each='rotor', allocated=True),
     'torque_coefficient': Effect(
         'body', {'torque_to_thrust_ratio': EffectParameter(
             'm', NAN, 0.0, 0.2, 0.2, 0.03, number='rotors.torque_to_thrust_ratio',
             tolerance='torque_ratio')},
         'tau_i = -spin_i ratio f_i about the thrust axis', 'yaw steps, differential thrust',
         ('joint_offset', 'rotor_acceleration_torque'), 'yaw steps at zero tilt',
-        sets('torque_ratio'), allocated=True, plant='model'),
+        sets('torque_ratio'), allocated=True),
     'ground_effect': Effect(
         'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0, 0.08, 0.01),
                  'exponential_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},

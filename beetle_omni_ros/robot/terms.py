@@ -148,9 +148,6 @@ class Effect:
     limit: tuple[str, float] | None = None
     allocated: bool = False     # the allocation includes it
     measured: tuple[str, ...] = ()  # terms of MEASURED; where one is None, it is left out
-    # How the simulated plant includes a body effect. 'model': numbers of its bodies and rotors,
-    # '': the equation of this entry.
-    plant: str = ''
     # Name of CONSUMERS -> why it ignores the effect, where this does not follow from its kind.
     ignored_by: dict[str, str] = field(default_factory=dict)
 
