@@ -116,9 +116,6 @@ class ModuleParameters:
     """One tilting rotor module."""
 
     mass: float = parameter(doc='mass', unit='kg', low=0, high=20)
-    joint_offset: float | None = parameter(
-        None, doc='|x| = |y| of the joint origin in the main body frame; not used, it follows '
-        'from rotors.positions', unit='m', low=0, high=5)
     joint_height: float = parameter(doc='z of the joint origin', unit='m', low=-5, high=5)
     centre_of_mass: np.ndarray = parameter(
         doc='outward, sideways, up from the joint axis', unit='m', shape=(3,))
@@ -138,20 +135,10 @@ class EndEffectorParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class MultibodyParameters:
-    """
-    Parts of the rigid body; the rest of the totals is the main body.
+    """Parts of the rigid body; the rest of the totals is the main body."""
 
-    The published values of this rest are kept for the hash of the robot, by which policy files
-    name the robot that they were trained for.
-    """
-
-    main_body: dict = parameter({}, doc='centre_of_mass and inertia of the main body; not used, '
-                                'they follow from the totals')
     module: ModuleParameters = parameter(doc='tilting module')
     end_effector: EndEffectorParameters = parameter(doc='end-effector')
-    centre_of_gravity_height: float | None = parameter(
-        None, doc='height above the main body origin; not used, it follows from '
-        'rotors.positions', unit='m', low=-5, high=5)
 
     @classmethod
     def from_totals(cls, module_inertia: float = 0.0,
@@ -333,7 +320,7 @@ class RobotParameters:
         return self.mass * self.gravity / 4
 
     def hash(self) -> str:
-        """Short digest of all physical values, for caches and policy files."""
+        """Short digest of all physical values, for caches."""
         text = yaml.safe_dump(self.as_dict(), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -341,8 +328,6 @@ class RobotParameters:
         """All physical values as plain nested data, without name, intervals and provenance."""
         values = asdict(self)
         del values['name'], values['intervals'], values['provenance']
-        if self.rotors.motor is None:   # so that policy files of robots without it stay valid
-            del values['rotors']['motor']
         return json.loads(json.dumps(values, default=np.ndarray.tolist))
 
 
