@@ -244,7 +244,8 @@ def _wrapped(text: str) -> str:
 
 def effects() -> str:
     """The catalogue of effects."""
-    from beetle_omni_ros.robot.effects import CATALOGUE, CONSUMERS, ignored
+    from beetle_omni_ros.robot.catalogue import CONSUMERS, ignored
+    from beetle_omni_ros.robot.effects import CATALOGUE
     apart: dict[tuple, list] = {}
     for name in CATALOGUE:
         for key, consumer in CONSUMERS.items():

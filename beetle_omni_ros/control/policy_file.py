@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.robot.effects import CATALOGUE, ignored
+from beetle_omni_ros.robot.catalogue import ignored
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES, value_of
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import nest, ParameterError, quoted, shortened

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from beetle_omni_ros.robot import effects as catalogue
-from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot import catalogue, schema
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter, ParameterError, quoted
 from beetle_omni_ros.robot.terms import SensorErrors
@@ -312,7 +312,7 @@ class RobotParameters:
         """Sensor errors by the effects."""
         return SensorErrors(**{
             spec.sensor: values[parameter] for name, values in self.effects.items()
-            for parameter, spec in catalogue.CATALOGUE[name].parameters.items() if spec.sensor})
+            for parameter, spec in CATALOGUE[name].parameters.items() if spec.sensor})
 
     @property
     def hover_thrust(self) -> float:

@@ -16,7 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.robot.effects import delaying
+from beetle_omni_ros.robot.catalogue import delaying
 from beetle_omni_ros.robot.parameters import JointParameters, RobotParameters
 
 SLIDING_RATE = 0.05     # [rad/s] over which friction falls from stiction to Coulomb friction

@@ -54,6 +54,11 @@ class Terms:
         body = self.rotation.T @ self.velocity
         return [body + ca.cross(self.angular_velocity, r) for r in self.rotor_positions]
 
+    def in_plane_velocities(self) -> list:
+        """Parts of :meth:`hub_velocities` in the planes of the rotors."""
+        return [v - n * ca.dot(n, v) for n, v in zip(
+            self.thrust_directions, self.hub_velocities(), strict=True)]
+
 
 @dataclass
 class ServoTerms:

@@ -22,7 +22,8 @@ from beetle_omni_ros.identify.gap.series import (
     turned,
     within,
 )
-from beetle_omni_ros.robot.effects import CATALOGUE, ignored
+from beetle_omni_ros.robot.catalogue import ignored
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import play
 

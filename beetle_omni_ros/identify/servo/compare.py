@@ -24,7 +24,8 @@ from beetle_omni_ros.identify.servo.joint import identify, joint_results, separa
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX, NAMES, with_encoder_errors
 from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
-from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
+from beetle_omni_ros.robot.catalogue import separating_experiment
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag import BagError, read_messages
 
