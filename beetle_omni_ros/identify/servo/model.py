@@ -21,7 +21,7 @@ import numpy as np
 from beetle_omni_ros.identify.inference.hierarchy import Spread
 from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.robot.native import built, EXACT, generated
-from beetle_omni_ros.robot.parameters import JointParameters
+from beetle_omni_ros.robot.parts import JointParameters
 from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.robot.servo import CASADI, play, Servo, Step
 
