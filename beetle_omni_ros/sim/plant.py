@@ -70,6 +70,8 @@ class Plant:
         # Views of MuJoCo's state, stored because each access takes time.
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
+        self._commanded_thrust, self._act = self.data.ctrl[:4], self.data.act
+        self._acceleration, self._applied = self.data.qacc, self.data.qfrc_applied[:6]
         self.voltage_ratio, self.charge_drawn = 1.0, 0.0
         self.wrench = np.zeros(6)
         self._payload: float | None = None      # not yet set
@@ -202,22 +204,25 @@ class Plant:
 
         Those in the middle of a tick, held during it, are accurate to second order.
         """
-        data, rotors = self.data, self._robot.rotors
-        applied = data.qfrc_applied[:6]
+        applied = self._applied
         applied[:] = self.wrench
         if not self._added.active:
             return
-        thrust = data.act - np.expm1(-ahead / rotors.time_constant) * (data.ctrl[:4] - data.act)
-        motion = self._qvel + ahead * data.qacc
-        driven = tilt = self._tilt + ahead * self._rate
-        if self._has_play:
-            tilt = clipped(self._shaft, driven - self._half_gap, driven + self._half_gap)
+        lag, commanded = self._robot.rotors.time_constant, self._scale * self._commanded_thrust
+        thrust, quaternion = self._scale * self._act, self._qpos[XYZW]
+        motion, driven = self._qvel, self._tilt
+        if ahead:
+            thrust = thrust - np.expm1(-ahead / lag) * (commanded - thrust)
+            quaternion = rotations.multiply(quaternion, rotations.exp(ahead * motion[3:6]))
+            driven = driven + ahead * self._rate
+            motion = motion + ahead * self._acceleration
+        tilt = clipped(self._shaft, driven - self._half_gap, driven + self._half_gap) \
+            if self._has_play else driven
         applied += self._added(
-            rotations.multiply(self._qpos[XYZW], rotations.exp(ahead * self._qvel[3:6])),
-            driven, data.qacc[6:], self.charge_drawn, position=self._qpos[:3],
-            velocity=motion[:3], rate=motion[3:6], tilt=tilt, tilt_rate=motion[6:],
-            thrust=self._scale * thrust, voltage_ratio=self.voltage_ratio,
-            thrust_rate=self._scale * (data.ctrl[:4] - thrust) / rotors.time_constant)
+            quaternion, driven, self._acceleration[6:], self.charge_drawn,
+            position=self._qpos[:3], velocity=motion[:3], rate=motion[3:6], tilt=tilt,
+            tilt_rate=motion[6:], thrust=thrust, thrust_rate=(commanded - thrust) / lag,
+            voltage_ratio=self.voltage_ratio)
 
     def _load_servos(self):
         """Set servo targets and joint torques from the commands by the effects on servos."""
