@@ -65,10 +65,9 @@ FILES = {
     'gap.yaml': ('identify.gap.parameters:GapParameters', 'The gap finder.')}
 
 ROBOT_FILE = """`mass`, `inertia` and `rotors.positions` are authoritative. With `multibody`, the
-simulated main body is what modules and end-effector leave of them. `multibody.main_body`,
-`multibody.module.joint_offset` and `multibody.centre_of_gravity_height` are published values of
-this rest, which no program uses. A file that extends another keeps each number that it does not
-state: beside a changed `mass` or `rotors.positions`, state the `inertia`.
+simulated main body is what modules and end-effector leave of them. A file that extends another
+keeps each number that it does not state: beside a changed `mass` or `rotors.positions`, state the
+`inertia`.
 
 """
 
@@ -243,7 +242,8 @@ def _wrapped(text: str) -> str:
 
 def effects() -> str:
     """The catalogue of effects."""
-    from beetle_omni_ros.robot.effects import CATALOGUE, CONSUMERS, ignored
+    from beetle_omni_ros.robot.catalogue import CONSUMERS, ignored
+    from beetle_omni_ros.robot.effects import CATALOGUE
     apart: dict[tuple, list] = {}
     for name in CATALOGUE:
         for key, consumer in CONSUMERS.items():

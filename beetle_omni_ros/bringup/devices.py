@@ -18,7 +18,8 @@ import numpy as np
 from beetle_omni_ros.bringup.findings import Findings, ObservedGraph
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
-from beetle_omni_ros.robot.parameters import JointParameters, RobotParameters
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parts import JointParameters
 
 SYS = Path('/sys')
 GUIDE = 'docs/how-to/hardware.md'

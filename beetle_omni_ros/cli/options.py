@@ -1,10 +1,11 @@
 """Options that several subcommands share, with the checks of their values."""
 
+from functools import partial
 import os
 from pathlib import Path
 from typing import Annotated
 
-from typer import CallbackParam, Option
+from typer import CallbackParam, Option, Typer
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.schema import ParameterError
@@ -14,6 +15,9 @@ CONDITIONS = ('nominal', 'published')
 # Without controllers of other packages, because --help does not search installed packages.
 KNOWN = f"{', '.join(registry.SHIPPED)}, any registered one, {registry.CLASS}"
 DEFAULT_ROBOT = 'Default: the shipped params/robot.yaml.'
+# The panels of rich show a flag as <bool> and leave out the other name of --standby/--alone.
+Commands = partial(Typer, no_args_is_help=True, rich_markup_mode=None,
+                   context_settings={'help_option_names': ['-h', '--help']})
 
 
 def one_of(param: CallbackParam, value: str | None) -> str | None:

@@ -10,7 +10,7 @@ from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.rotations import entries
-from beetle_omni_ros.robot.schema import bind, parameter, ParameterFile
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
 LATEST = 10             # steps within which a command is reported as the executed command
@@ -57,8 +57,7 @@ class PolicyController:
             from beetle_omni_ros.control import disturbance
             from beetle_omni_ros.robot.dynamics import integrator
             # The disturbance of another robot is its difference from that of the training.
-            known = robot if contract.robot_hash == robot.hash() else bind(
-                RobotParameters, {'name': contract.robot, **contract.robot_values}, p.policy)
+            known = contract.trained_robot(robot)
             self._estimator = disturbance.DisturbanceEstimator(
                 known, disturbance.DisturbanceParameters(), COMMAND_DELAY, integrator(known))
         self._guidance = Guidance(robot.tilt_axes, p.without)

@@ -21,10 +21,11 @@ from typing import Any
 
 import numpy as np
 
+from beetle_omni_ros.robot.catalogue import ignored
 from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES, value_of
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError, quoted, shortened
+from beetle_omni_ros.robot.schema import nest, ParameterError, quoted, shortened
 
 log = logging.getLogger(__name__)
 FORMAT = 'beetle_omni_policy/1'
@@ -37,6 +38,16 @@ FATAL_ONLY = 4          # onnxruntime's log level: errors are raised, and report
 # The checksum as ONNX's protobuf stores it; DIGITS hexadecimal digits follow.
 ENTRY, DIGITS = b'rS\n\x08checksum\x12Gsha256:', 64
 
+# What a policy is trained for: the values of a robot file that the training environment uses.
+# With other names, or other keys in a file, the version increases.
+TRAINED_FOR_VERSION = 1
+TRAINED_FOR = (
+    'mass', 'gravity', 'inertia', *(f'rotors.{name}' for name in (
+        'positions', 'arm_yaw', 'spin', 'torque_to_thrust_ratio', 'thrust_min', 'thrust_max',
+        'time_constant')),
+    *(f'joints.{name}' for name in (
+        'inertia', 'kp', 'kd', 'velocity_limit', 'effort_limit', 'position_limit')),
+    *(f'multibody.module.{name}' for name in ('mass', 'centre_of_mass', 'inertia')), 'effects')
 
 # Blocks of the observation: SI unit ('1': none), and what the values belong to; the last two are
 # those of a policy with memory.
@@ -65,8 +76,8 @@ class PolicyContract:
     action_offset: list[float]
     rate_hz: float
     robot: str
-    robot_hash: str
-    robot_values: dict              # :meth:`RobotParameters.as_dict`; {} in an old file
+    robot_hash: str                 # :func:`robot_hash` of the values
+    robot_values: dict              # :func:`trained_for`
     name: str
     training: dict = field(default_factory=dict)
     commit: str = ''
@@ -80,7 +91,7 @@ class PolicyContract:
                    actions=[*JOINT_NAMES, *ROTOR_NAMES],
                    action_scale=[TILT_SCALE] * 4 + [THRUST_SCALE] * 4,
                    action_offset=[0.0] * 4 + [robot.hover_thrust] * 4, rate_hz=RATE_HZ,
-                   robot=robot.name, robot_hash=robot.hash(), robot_values=robot.as_dict(),
+                   robot=robot.name, robot_hash=robot_hash(robot), robot_values=trained_for(robot),
                    name='rl_any' if memory else 'rl')
 
     @property
@@ -112,7 +123,23 @@ class PolicyContract:
             except (RecursionError, ValueError):
                 raise ParameterError(f"metadata '{key}': missing or unusable, found "
                                      f'{quoted(text)}') from None
+        if ':' not in values['robot_hash'] and values['robot_values']:
+            # a file of an earlier version, whose hash covered every value of the robot file
+            values['robot_hash'] = robot_hash(values['robot_values'])
         return cls(**values)
+
+    def trained_robot(self, robot: RobotParameters) -> RobotParameters:
+        """``robot`` with the values for which the policy is trained, but for its modules."""
+        if self.robot_hash == robot_hash(robot):
+            return robot
+        if not self.robot_values:
+            raise ParameterError("metadata 'robot_values': missing, expected the values of the "
+                                 'robot of the training')
+        values = trained_for(self.robot_values)
+        parts = {part: replace(getattr(robot, part), **_arrays(values[part]))
+                 for part in ('rotors', 'joints')}
+        return replace(robot, **parts, effects=values['effects'], **_arrays(
+            {name: values[name] for name in ('mass', 'gravity', 'inertia')}))
 
     def check(self, robot: RobotParameters, allow_other_robot: bool = False) -> str:
         """
@@ -122,15 +149,9 @@ class PolicyContract:
             A warning, one line, when another robot was allowed; else ''.
 
         """
-        # Effects of sensors are corrected by the estimator and do not concern the policy.
-        flown = replace(robot, effects={name: values for name, values in robot.effects.items()
-                                        if CATALOGUE[name].kind != 'sensor'})
-        expected, warning = PolicyContract.default(flown, self.memory), ''
+        expected, warning = PolicyContract.default(robot, self.memory), ''
         if self.robot_hash != expected.robot_hash:
-            known, shipped = self.robot_values, RobotParameters.load()
-            if not known and shipped.hash() == self.robot_hash:
-                known = shipped.as_dict()
-            found = list(_differences(expected.robot_values, known or expected.robot_values)) or [
+            found = list(_differences(expected.robot_values, trained_for(self.robot_values))) or [
                 f'robot_hash {self.robot_hash} in training, {expected.robot_hash} here']
             warning = f"trained for other robot parameters: {shortened('; '.join(found), LONGEST)}"
         for key in ('observations', 'actions', 'action_scale', 'rate_hz',
@@ -146,6 +167,37 @@ class PolicyContract:
                                  'with --allow-other-robot (evaluate and fly; '
                                  'allow_other_robot:=true of launch file and nodes)')
         return warning
+
+
+def trained_for(robot: RobotParameters | dict) -> dict:
+    """
+    Values of ``TRAINED_FOR``, nested, of a robot or of the ``robot_values`` of a file.
+
+    Effects that the training leaves out, as those that the estimator corrects, are no part of it.
+    """
+    values = {key: value_of(robot, key) for key in TRAINED_FOR}
+    values['effects'] = {name: each for name, each in (values['effects'] or {}).items()
+                         if name not in CATALOGUE or not ignored('training', name)}
+    return _plain(nest(values))
+
+
+def robot_hash(robot: RobotParameters | dict) -> str:
+    """Version and digest of what a policy is trained for, by name."""
+    text = json.dumps(trained_for(robot), sort_keys=True)
+    return f'{TRAINED_FOR_VERSION}:{sha256(text.encode()).hexdigest()[:16]}'
+
+
+def _plain(value):
+    """Nested mapping with floats and lists of floats."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
+    return value if value is None else np.asarray(value, dtype=float).tolist()
+
+
+def _arrays(values):
+    """``values`` with arrays for lists."""
+    return {key: np.array(value) if isinstance(value, list) else value
+            for key, value in values.items()}
 
 
 def _differences(flown, trained, prefix=''):

@@ -3,8 +3,9 @@ The robot's dynamics in CasADi: x' = f(x, u, p).
 
 The model is a rigid body with four tilted thrusts and their reaction torques, first-order rotor
 lag and second-order tilt servos within limits. It includes the effects that the robot file names.
-The NMPC predicts with it, C code is generated from it, and identification fits it. MuJoCo has its
-own equations of rigid bodies; for wind, drag and servos the simulated plant uses those below.
+The NMPC predicts with it, C code is generated from it, and identification fits it. The simulated
+plant has its own equations, in MuJoCo and :mod:`sim.forces`. It shares with this model the law of
+joint friction, and the equations of effects that only the catalogue has.
 """
 
 import casadi as ca

@@ -6,12 +6,8 @@ it is confused with. A robot file enables an effect by naming it; the place of a
 its kind, see :attr:`Effect.kind`.
 """
 
-from collections.abc import Sequence
-
 import casadi as ca
-import numpy as np
 
-from beetle_omni_ros.robot.schema import numbers, ParameterError, quoted, unknown
 from beetle_omni_ros.robot.terms import Effect, EffectParameter, NAN
 
 UP = ca.DM([0, 0, 1])
@@ -19,10 +15,6 @@ REFERENCE_HEIGHT = 0.25     # [m] of the rotor, for which the gain of the ground
 EXPONENTIAL_HEIGHT = 0.25   # [m] over which the exponential form falls to 1/e
 LEAST_HEIGHT = 0.08         # [m] below which the forms are not valid
 NO_JOINTS = 'the filter does not read the joints'
-# Terms that the simulated plant and the gap finder have -> why NMPC and training leave out an
-# effect of them.
-MEASURED = {'voltage_ratio': 'it has no voltage and assumes a full pack',
-            'charge_drawn': 'it has no current of the pack and assumes that no charge was drawn'}
 
 
 def vector(values):
@@ -33,10 +25,7 @@ def vector(values):
 
 def sets(term):
     """Equation of an effect whose one parameter replaces a term."""
-    def act(terms, **values):
-        value, = values.values()
-        setattr(terms, term, vector(value))
-    return act
+    return lambda terms, **values: setattr(terms, term, vector(*values.values()))
 
 
 def centre_of_mass(terms, offset):
@@ -72,10 +61,8 @@ def body_drag(terms, coefficient):
 
 def rotor_drag(terms, coefficient):
     speeds = terms.rotor_speeds()
-    for i, v in enumerate(terms.hub_velocities()):
-        n = terms.thrust_directions[i]
-        in_plane = v - n * ca.dot(n, v)
-        terms.rotor_forces[i] = terms.rotor_forces[i] - coefficient / 4 * speeds[i] * in_plane
+    for i, v in enumerate(terms.in_plane_velocities()):
+        terms.rotor_forces[i] = terms.rotor_forces[i] - coefficient / 4 * speeds[i] * v
 
 
 def rotor_hub_moment(terms, coefficient):
@@ -93,10 +80,7 @@ def axial_inflow(terms, per_rotor):
 
 
 def translational_lift(terms, per_rotor):
-    gain = []
-    for i, v in enumerate(terms.hub_velocities()):
-        n = terms.thrust_directions[i]
-        gain.append(per_rotor * ca.sumsqr(v - n * ca.dot(n, v)))
+    gain = [per_rotor * ca.sumsqr(v) for v in terms.in_plane_velocities()]
     terms.thrust = terms.thrust + ca.vertcat(*gain)
 
 
@@ -121,8 +105,7 @@ def ground_effect(terms, exponential_share=0.0, **values):
     terms.thrust = terms.thrust * ca.vertcat(*scale)
 
 
-def gyroscopic_load(servo, joint, angular_momentum_at_hover, spin_up_share=1.0,
-                     joint_share=0.0):
+def gyroscopic_load(servo, joint, angular_momentum_at_hover, spin_up_share=1.0, joint_share=0.0):
     servo.load = servo.load + joint_share * angular_momentum_at_hover * servo.gyroscopic
 
 
@@ -159,7 +142,7 @@ def joint_offset(terms, offset):
 
 
 def joint_deflection(servo, joint, deflection_per_newton):
-    servo.target = servo.target + per_joint(deflection_per_newton, joint) * servo.thrust
+    servo.target = servo.target + deflection_per_newton * servo.thrust
 
 
 def per_joint(value, joint: int):
@@ -168,8 +151,7 @@ def per_joint(value, joint: int):
 
 
 def joint_friction(servo, joint, coulomb, stiction):
-    servo.coulomb = per_joint(coulomb, joint)
-    servo.stiction = per_joint(stiction, joint)
+    servo.coulomb, servo.stiction = per_joint(coulomb, joint), per_joint(stiction, joint)
 
 
 def _delay(typical, smallest=0.003, **more):
@@ -191,52 +173,49 @@ CATALOGUE: dict[str, Effect] = {
     'mass': Effect(
         'body', {'mass': EffectParameter('kg', NAN, 0.005, 200, 0.05, 0.01, number='mass',
                                          tolerance='mass')},
-        "m v' = F, Newton; total mass", 'any flight',
-        ('thrust_coefficient', 'voltage_sag', 'wind'),
+        "m v' = F; total mass", 'any flight', ('thrust_coefficient', 'voltage_sag', 'wind'),
         'weigh the robot, or fly fast turns: thrust scales torques too, mass does not',
-        sets('mass'), allocated=True, plant='model'),
+        sets('mass'), allocated=True),
     'inertia': Effect(
         'body', {'inertia': EffectParameter('kg m^2', (NAN,) * 3, 1e-6, 50, 0.2, 0.05,
                                             number='inertia', tolerance='inertia')},
         "I w' = tau - w x I w, Euler", 'fast turns about every axis',
         ('rotor_lag', 'propeller_gyroscopic_torque', 'thrust_coefficient'),
-        'flips by 90 and 180 deg about each axis', sets('inertia'), plant='model'),
+        'flips by 90 and 180 deg about each axis', sets('inertia')),
     'centre_of_mass': Effect(
         'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2, 0.005, 0.0015)},
         'forces turn the body about its centre of mass, which is displaced from base_link',
         'hover in several attitudes', ('rotor_thrust_coefficient', 'module_reaction'),
-        'hover at roll 0, 90, 180 deg and pitch 90 deg', centre_of_mass, plant='model'),
+        'hover at roll 0, 90, 180 deg and pitch 90 deg', centre_of_mass),
     'module_reaction': Effect(
         'body', {'module_inertia': EffectParameter('kg m^2', 0.0, 0.0, 0.1, 1e-4, 2e-5,
                                                    step=2e-5),
                  'mass_moment': EffectParameter('kg m', 0.0, 0.0, 1.0, 2e-3, 3e-4, 0.0,
                                                 step=2e-4)},
         "servo torque J q'' on the body; centre of mass moved by -moment / m (t(q) - t(0)), "
-        "reaction force moment (n'' + 2 w x n'); "
-        'multibody section of the robot file', 'fast tilting, turned attitudes',
-        ('centre_of_mass', 'inertia'), 'the same attitude with tilts turned by 180 deg',
-        module_reaction, channels='BJ', plant='model', ignored_by={
-            'plant': 'its modules are bodies with the masses of the multibody section; without '
-                     'that section it acts'}),
+        "reaction force moment (n'' + 2 w x n'); multibody section of the robot file",
+        'fast tilting, turned attitudes', ('centre_of_mass', 'inertia'),
+        'the same attitude with tilts turned by 180 deg', module_reaction, channels='BJ',
+        ignored_by={'plant': 'its modules are bodies with the masses of the multibody section; '
+                             'without that section it acts'}),
     'thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0, 0.05, 0.01, tolerance='thrust')},
         'f = scale f*, all rotors', 'any flight', ('mass', 'voltage_sag', 'tilt_thrust_loss'),
-        'weigh the robot; flights at two states of charge', thrust_coefficient,
-        allocated=True, plant='model'),
+        'weigh the robot; flights at two states of charge', thrust_coefficient, allocated=True),
     'rotor_thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', (1.0,) * 4, 0.0, 2.0, 0.08, 0.015,
                                           tolerance='thrust')},
         'f_i = scale_i f*_i: damaged propeller or other speed controller',
         'hover in several attitudes', ('centre_of_mass', 'rotor_thrust_coefficient'),
         'tilted attitudes; exchange propellers 1 and 2', thrust_coefficient,
-        each='rotor', allocated=True, plant='model'),
+        each='rotor', allocated=True),
     'torque_coefficient': Effect(
         'body', {'torque_to_thrust_ratio': EffectParameter(
             'm', NAN, 0.0, 0.2, 0.2, 0.03, number='rotors.torque_to_thrust_ratio',
             tolerance='torque_ratio')},
         'tau_i = -spin_i ratio f_i about the thrust axis', 'yaw steps, differential thrust',
         ('joint_offset', 'rotor_acceleration_torque'), 'yaw steps at zero tilt',
-        sets('torque_ratio'), allocated=True, plant='model'),
+        sets('torque_ratio'), allocated=True),
     'ground_effect': Effect(
         'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0, 0.08, 0.01),
                  'exponential_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
@@ -322,16 +301,13 @@ CATALOGUE: dict[str, Effect] = {
         'sine sweep of the tilts 0.5 to 6 Hz with thrust steps', delays=('tilt', 'thrust'),
         channels='BJ'),
     'joint_command_latency': Effect(
-        'joint', _delay(0.02),
-        'q*(t - d)', 'fast tilting',
+        'joint', _delay(0.02), 'q*(t - d)', 'fast tilting',
         ('joint_bandwidth', 'command_latency', 'joint_feedback_delay'),
         'sine sweep of the tilts 0.5 to 6 Hz', delays=('tilt',), channels='J'),
     'joint_bandwidth': Effect(
-        'joint', {
-            'kp': _number('joints.kp', 'N m/rad', 1e-4, 1e3, 0.3, 0.1, tolerance='lag',
-                          of_each=True),
-            'kd': _number('joints.kd', 'N m s/rad', 0.0, 1e2, 0.3, 0.1, tolerance='lag',
-                          of_each=True)},
+        'joint', {name: _number(f'joints.{name}', unit, low, high, 0.3, 0.1, tolerance='lag',
+                                of_each=True) for name, unit, low, high in (
+            ('kp', 'N m/rad', 1e-4, 1e3), ('kd', 'N m s/rad', 0.0, 1e2))},
         "J q'' = Kp (q* - q) - Kd q'", 'fast tilting', ('joint_command_latency',
                                                        'joint_torque_limit'),
         'sine sweep of the tilts 0.5 to 6 Hz with two amplitudes', channels='J'),
@@ -381,8 +357,8 @@ CATALOGUE: dict[str, Effect] = {
                                            'it to a response log'}),
     'joint_feedback_delay': Effect(
         'timing', _delay(0.01, sensor='encoder_delay', tolerance='delay'),
-        'the encoder reading is older than its stamp by d',
-        'fast tilting', ('joint_command_latency', 'mocap_time_offset', 'joint_backlash'),
+        'the encoder reading is older than its stamp by d', 'fast tilting',
+        ('joint_command_latency', 'mocap_time_offset', 'joint_backlash'),
         'tilting by internal force with the body at rest', delays=('encoders',), channels='BJ'),
     'mocap_time_offset': Effect(
         'timing', _delay(0.01, 0.002, sensor='mocap_delay', tolerance='delay'),
@@ -390,8 +366,8 @@ CATALOGUE: dict[str, Effect] = {
         'any turn above 1 rad/s', delays=('mocap',), channels='AW'),
     'imu_filter_lag': Effect(
         'timing', _delay(0.01, 0.002, sensor='imu_delay', tolerance='delay'),
-        'specific force and rates are older than their stamp by d: '
-        'filters of the IMU', 'fast turns', ('mocap_time_offset', 'rotor_dead_time'),
+        'specific force and rates are older than their stamp by d: filters of the IMU',
+        'fast turns', ('mocap_time_offset', 'rotor_dead_time'),
         'turns above 1 rad/s with thrust steps; log the raw gyroscope', delays=('imu',),
         channels='BAWJ'),
     'imu_accelerometer_bias': Effect(
@@ -421,74 +397,3 @@ CATALOGUE: dict[str, Effect] = {
         'marker axes rotated by exp(rotation) against base_link', 'several attitudes',
         ('imu_misalignment', 'wind'), 'hover at yaw 0, 90, 180 and 270 deg', channels='AW'),
 }
-
-CONSUMERS = {'nmpc': 'NMPC and allocation', 'training': 'training', 'plant': 'simulated plant',
-             'estimator': 'estimator', 'buses': 'delays of the buses', 'gap': 'gap finder'}
-_CORRECTED = 'the estimator corrects the readings first'
-_NO_MODEL = 'the filter integrates the IMU and has no model of forces or servos'
-# Consumer -> kind of effect -> why it ignores effects of this kind.
-_IGNORED = {
-    'nmpc': {'sensor': _CORRECTED,
-             'play': 'a play is an offset of the servos, which is estimated in flight'},
-    'training': {'sensor': _CORRECTED},
-    'estimator': {**dict.fromkeys(('body', 'servo', 'number', 'command', 'play'), _NO_MODEL),
-                  'feedback': NO_JOINTS},
-    'buses': dict.fromkeys(('body', 'servo', 'number', 'sensor', 'feedback', 'play'),
-                           'the effect delays no command')}
-
-
-def settings(effects: dict[str, dict]) -> dict[str, float]:
-    """Dotted keys of the robot file that validated effects replace, with the new values."""
-    return {key: effects[name][parameter] for name in effects
-            for parameter, key in CATALOGUE[name].settings.items()}
-
-
-def separating_experiment(names: Sequence[str]) -> str:
-    """Experiment that distinguishes entries, from the one with most others as confused."""
-    return CATALOGUE[max(names, key=lambda name: len(
-        set(CATALOGUE[name].confused_with) & set(names) - {name}))].separated_by
-
-
-def delaying(*what: str) -> tuple[str, ...]:
-    """Names of the effects that delay any of ``what``; see :attr:`Effect.delays`."""
-    return tuple(name for name, entry in CATALOGUE.items() if set(what) & set(entry.delays))
-
-
-def validated(effects: dict) -> dict[str, dict]:
-    """Complete and validate the parameters of effects: name -> parameter -> float or tuple."""
-    checked: dict[str, dict] = {}
-    for name, given in effects.items():
-        if name not in CATALOGUE:
-            raise unknown(f'effects.{name}', 'effect', name, CATALOGUE)
-        entry = CATALOGUE[name]
-        needed = {key for key, spec in entry.parameters.items() if spec.default is None}
-        if not isinstance(given, dict) or not needed <= set(given) <= set(entry.parameters):
-            expected = ', '.join(entry.parameters)
-            raise ParameterError(f'effects.{name}: expected the keys {expected}, '
-                                 f'found {quoted(given)}')
-        checked[name] = {key: _value(f'effects.{name}.{key}', spec, given.get(key, spec.default))
-                         for key, spec in entry.parameters.items()}
-    return checked
-
-
-def _value(at, spec, value):
-    array, shape = numbers(value, at, vars(spec)), np.shape(spec.neutral)
-    if spec.of_each and array.shape == (4,):
-        shape = array.shape
-    if array.shape != shape:
-        each = ' or (4,)' if spec.of_each else ''
-        raise ParameterError(f'{at}: expected shape {shape}{each}, found {array.shape}')
-    return tuple(map(float, array)) if shape else float(array)
-
-
-def ignored(consumer: str, name: str) -> str:
-    """
-    Why a consumer of ``CONSUMERS`` ignores an effect; '' if the effect acts in it.
-
-    This follows from the kind of effect, so that each new entry has a treatment.
-    ``test/gap/test_consumers.py`` checks every pair against the consumer's results.
-    """
-    effect = CATALOGUE[name]
-    if effect.measured and consumer in ('nmpc', 'training'):
-        return '; '.join(MEASURED[term] for term in effect.measured)
-    return effect.ignored_by.get(consumer) or _IGNORED.get(consumer, {}).get(effect.kind, '')

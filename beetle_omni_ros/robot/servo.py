@@ -16,8 +16,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.robot.effects import delaying
-from beetle_omni_ros.robot.parameters import JointParameters, RobotParameters
+from beetle_omni_ros.robot.catalogue import delaying
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parts import JointParameters
 
 SLIDING_RATE = 0.05     # [rad/s] over which friction falls from stiction to Coulomb friction
 # Functions in which the libraries differ, by numpy's names.

@@ -54,6 +54,11 @@ class Terms:
         body = self.rotation.T @ self.velocity
         return [body + ca.cross(self.angular_velocity, r) for r in self.rotor_positions]
 
+    def in_plane_velocities(self) -> list:
+        """Parts of :meth:`hub_velocities` in the planes of the rotors."""
+        return [v - n * ca.dot(n, v) for n, v in zip(
+            self.thrust_directions, self.hub_velocities(), strict=True)]
+
 
 @dataclass
 class ServoTerms:
@@ -147,9 +152,6 @@ class Effect:
     limit: tuple[str, float] | None = None
     allocated: bool = False     # the allocation includes it
     measured: tuple[str, ...] = ()  # terms of MEASURED; where one is None, it is left out
-    # How the simulated plant includes a body effect. 'model': numbers of its bodies and rotors,
-    # '': the equation of this entry.
-    plant: str = ''
     # Name of CONSUMERS -> why it ignores the effect, where this does not follow from its kind.
     ignored_by: dict[str, str] = field(default_factory=dict)
 

@@ -8,7 +8,7 @@ same duty. No cubic is therefore used beyond its measured thrusts.
 
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import RotorParameters
+from beetle_omni_ros.robot.parts import RotorParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
 STOP_DUTY, FULL_DUTY = 50.0, 100.0  # [% of 2000 us] 1000 us and 2000 us

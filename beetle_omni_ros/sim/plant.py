@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot import dynamics, native, rotations
+from beetle_omni_ros.robot import dynamics, rotations
 from beetle_omni_ros.robot.allocation import clipped
-from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import mass_properties, RobotParameters, Variation
 from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.robot.servo import NUMPY
+from beetle_omni_ros.sim.forces import AddedForces, ServoLoads
 from beetle_omni_ros.sim.mjcf import BASE, build_model, CONTACT_TIME, set_payload
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
@@ -49,17 +49,11 @@ class Plant:
                  variation: Variation | None = None):
         self._robot, self._parameters = robot, parameters
         self._parts = mass_properties(robot, variation)
-        # Effects that only change a number of the model are built into it.
-        forces = [name for name in robot.effects
-                  if CATALOGUE[name].apply and CATALOGUE[name].plant != 'model']
-        self._added_wrench = native.buffered(native.compiled(
-            dynamics.added_wrench(robot, forces))) if forces else None
         play = robot.effects.get('joint_backlash', {'gap': 0.0, 'at_encoder': 0.0})
         self._half_gap = np.broadcast_to(play['gap'], 4) / 2
         self._has_play, self._at_encoder = bool(self._half_gap.any()), bool(play['at_encoder'])
-        self._sideways = np.cross(robot.tilt_axes, [0.0, 0.0, 1.0])     # of a rotor at +90 deg
-        self._has_servo_loads = any(CATALOGUE[name].servo for name in robot.effects
-                                    if name != 'joint_friction')
+        self._added = AddedForces(robot, self._has_play)
+        self._loads = ServoLoads(robot)
         self._servo_terms = [dynamics.tilt_servo(robot, i, 0.0)[0] for i in range(4)]
         self._has_friction = self._servo_terms[0].coulomb is not None
         self._scale = robot.thrust_scale
@@ -76,6 +70,8 @@ class Plant:
         # Views of MuJoCo's state, stored because each access takes time.
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
+        self._commanded_thrust, self._act = self.data.ctrl[:4], self.data.act
+        self._acceleration, self._applied = self.data.qacc, self.data.qfrc_applied[:6]
         self.voltage_ratio, self.charge_drawn = 1.0, 0.0
         self.wrench = np.zeros(6)
         self._payload: float | None = None      # not yet set
@@ -145,7 +141,7 @@ class Plant:
     def step(self) -> None:
         """Advance one tick with the present targets; a RunError reports a diverged state."""
         model, data = self.model, self.data
-        if self._has_servo_loads:
+        if self._loads.active:
             self._load_servos()
         touching, fast = self._near_limits()
         model.opt.disableflags = self._flags if touching else self._flags | NO_CONSTRAINT
@@ -208,42 +204,31 @@ class Plant:
 
         Those in the middle of a tick, held during it, are accurate to second order.
         """
-        data, rotors = self.data, self._robot.rotors
-        applied = data.qfrc_applied[:6]
+        applied = self._applied
         applied[:] = self.wrench
-        if not (self._added_wrench or self._has_play):
+        if not self._added.active:
             return
-        lag = rotors.time_constant
-        thrust = data.act - np.expm1(-ahead / lag) * (data.ctrl[:4] - data.act)
-        quaternion = rotations.multiply(self._qpos[XYZW],
-                                        rotations.exp(ahead * self._qvel[3:6]))
-        motion = self._qvel + ahead * data.qacc
-        driven = tilt = self._tilt + ahead * self._rate
-        if self._has_play:
-            # MuJoCo's thrust acts along the motor's angle, the true one along the shaft's.
-            tilt = clipped(self._shaft, driven - self._half_gap, driven + self._half_gap)
-            change = (self._scale * thrust)[:, None] * (
-                (np.cos(tilt) - np.cos(driven))[:, None] * [0.0, 0.0, 1.0]
-                + (np.sin(tilt) - np.sin(driven))[:, None] * self._sideways)
-            applied[:3] += rotations.matrix(quaternion) @ change.sum(axis=0)
-            applied[3:] += np.cross(rotors.positions, change).sum(axis=0) \
-                - rotors.spin * self._robot.torque_ratio @ change
-        if self._added_wrench:
-            applied += self._added_wrench(
-                quaternion, motion[:3], motion[3:6], tilt, motion[6:], data.qacc[6:],
-                self._scale * thrust, self._scale * (data.ctrl[:4] - thrust) / lag,
-                self._qpos[:3], self.voltage_ratio, self.charge_drawn)
+        lag, commanded = self._robot.rotors.time_constant, self._scale * self._commanded_thrust
+        thrust, quaternion = self._scale * self._act, self._qpos[XYZW]
+        motion, driven = self._qvel, self._tilt
+        if ahead:
+            thrust = thrust - np.expm1(-ahead / lag) * (commanded - thrust)
+            quaternion = rotations.multiply(quaternion, rotations.exp(ahead * motion[3:6]))
+            driven = driven + ahead * self._rate
+            motion = motion + ahead * self._acceleration
+        tilt = clipped(self._shaft, driven - self._half_gap, driven + self._half_gap) \
+            if self._has_play else driven
+        applied += self._added(
+            quaternion, driven, self._acceleration[6:], self.charge_drawn,
+            position=self._qpos[:3], velocity=motion[:3], rate=motion[3:6], tilt=tilt,
+            tilt_rate=motion[6:], thrust=thrust, thrust_rate=(commanded - thrust) / lag,
+            voltage_ratio=self.voltage_ratio)
 
     def _load_servos(self):
         """Set servo targets and joint torques from the commands by the effects on servos."""
-        thrust = self._scale * self.data.act
-        for i in range(4):
-            load = dynamics.gyroscopic_load(self._robot, self._qvel[3:6], self._tilt[i],
-                                            thrust[i], i)
-            _, terms = dynamics.tilt_servo(self._robot, i, self._commanded_tilt[i], thrust[i],
-                                           float(load))
-            self._target[i] = terms.target
-            self.data.qfrc_applied[6 + i] = terms.load + self._friction[i]
+        self._target[:], load = self._loads(self._commanded_tilt, self._tilt, self._qvel[3:6],
+                                            self._scale * self.data.act)
+        self.data.qfrc_applied[6:] = load + self._friction
 
     def _rub(self, others):
         """

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
+from beetle_omni_ros.control.policy_file import robot_hash
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.train import rewards
@@ -42,7 +43,7 @@ class Runner:
                  folder: Path | None = None, device: str = 'cpu', graphs: bool | None = None,
                  teacher: Path | None = None):
         self.parameters, self.folder = parameters, folder
-        self._robot_hash = robot.hash()
+        self._robot_hash = robot_hash(robot)
         torch.manual_seed(parameters.seed)
         self.env = TiltableQuadrotorEnv(parameters, robot, device, compiled=graphs)
         self.alg = GraphPpo(self.env, parameters,

@@ -13,6 +13,8 @@ from beetle_omni_ros.control.policy_file import (
     add_checksum,
     PolicyContract,
     PolicyNetwork,
+    robot_hash,
+    trained_for,
 )
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -35,7 +37,8 @@ def table(change):
     ({'action_scale': '[0.25]'}, ['action_scale', 'None']),
     ({'action_offset': '[0, 0, 0, 0, NaN, 1, 1, 1]'}, ['action_offset', 'nan']),
     ({'rate_hz': '200'}, ['rate_hz', '100', '200']),
-    ({'robot_hash': 'feedbeef'}, ['robot_hash', 'feedbeef', ROBOT.hash(), 'allow_other_robot']),
+    ({'robot_hash': '1:feedbeef'},
+     ['robot_hash', '1:feedbeef', robot_hash(ROBOT), 'allow_other_robot']),
     ({'observations': table(list.reverse)}, ['observations', 'velocity']),
     ({'observations': table(lambda rows: rows[5].update(size=8))},
      ['tilt', "'size': 4", "'size': 8"]),
@@ -58,10 +61,11 @@ def test_other_metadata_are_refused_with_the_entry_and_both_values(metadata, nam
      ['mass 3.0386 in training, 3.2 here', 'joints.kp 0.3449 in training, 0.2 here']),
     (replace(ROBOT, effects={'thrust_coefficient': {'scale': 0.93}}),
      ["effects {} in training, {'thrust_coefficient': {'scale': 0.93}} here"]),
-    (replace(ROBOT, multibody=None), ['in training, None here'])])
+    (replace(ROBOT, multibody=None), [
+        'mass 0.16444 in training, None here', 'multibody.module.centre_of_mass',
+        'multibody.module.inertia'])])
 def test_another_robot_is_refused_with_the_parameters_and_may_be_allowed(flown, named):
-    # values of the shipped robot are known by its hash
-    contract = replace(PolicyContract.default(ROBOT), robot_values={})
+    contract = PolicyContract.default(ROBOT)
     with pytest.raises(ParameterError, match='--allow-other-robot') as error:
         contract.check(flown)
     warning = contract.check(flown, allow_other_robot=True)
@@ -73,9 +77,31 @@ def test_another_robot_is_refused_with_the_parameters_and_may_be_allowed(flown, 
 
 
 @pytest.mark.parametrize('changes', [
-    {'name': 'twin'}, {'effects': {'imu_misalignment': {'rotation': (0.01, 0.0, 0.02)}}}])
-def test_a_name_and_sensor_effects_that_the_estimator_corrects_are_no_difference(changes):
+    {'name': 'twin'}, {'effects': {'imu_misalignment': {'rotation': (0.01, 0.0, 0.02)}}},
+    {'battery': replace(ROBOT.battery, resistance=0.1)}, {'intervals': {}},
+    {'rotors': replace(ROBOT.rotors, map=ROBOT.rotors.map[1:])},
+    {'effects': {'voltage_sag': {'exponent': 1.0}}}])
+def test_what_the_training_does_not_use_is_no_difference(changes):
     assert PolicyContract.default(ROBOT).check(replace(ROBOT, **changes)) == ''
+
+
+def test_the_hash_of_values_in_any_order_with_further_ones_is_that_of_the_robot():
+    values = {**ROBOT.as_dict(), 'removed': {'value': 3}}
+    turned = {key: dict(reversed(value.items())) if isinstance(value, dict) else value
+              for key, value in reversed(values.items())}
+    assert robot_hash(turned) == robot_hash(trained_for(ROBOT)) == robot_hash(ROBOT)
+
+
+@pytest.mark.parametrize('name', ['rl', 'rl_any', 'rl_published'])
+def test_a_shipped_policy_of_a_version_that_covered_every_value_is_valid(name):
+    network = PolicyNetwork(f'policies/{name}.onnx', ROBOT)
+    assert network.contract.robot_hash == robot_hash(ROBOT)
+    heavy = replace(ROBOT, mass=3.1, effects={'joint_bandwidth': {
+        'kp': (0.2, 0.3, 0.3, 0.3), 'kd': 0.009}})
+    with pytest.raises(ParameterError, match='mass 3.0386 in training, 3.1 here'):
+        PolicyNetwork(f'policies/{name}.onnx', heavy)
+    trained = network.contract.trained_robot(heavy)
+    assert robot_hash(replace(trained, multibody=ROBOT.multibody)) == robot_hash(ROBOT)
 
 
 def refusal(path):

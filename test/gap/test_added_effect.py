@@ -18,7 +18,7 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.command import gap_results
 from beetle_omni_ros.identify.gap.ingest import prepare
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
-from beetle_omni_ros.robot import effects
+from beetle_omni_ros.robot import catalogue
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs/how-to/add_an_effect.md'
@@ -49,7 +49,7 @@ def test_the_test_of_the_page_passes_only_with_the_new_entry(monkeypatch):
 @pytest.mark.parametrize('consumer', ['nmpc', 'training', 'plant'])
 @pytest.mark.parametrize('name', [HEAT, FADE])
 def test_a_consumer_applies_the_added_effect_or_has_no_such_quantity(name, consumer):
-    reason = effects.ignored(consumer, name)
+    reason = catalogue.ignored(consumer, name)
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](with_effect(name))])
     assert (not reason) == (name == HEAT or consumer == 'plant')
     assert np.array_equal(found, plain(consumer)) == bool(reason)

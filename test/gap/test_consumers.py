@@ -13,7 +13,7 @@ from beetle_omni_ros.control.nmpc import NmpcParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.identify.gap.keys import number_of
-from beetle_omni_ros.robot import dynamics, effects
+from beetle_omni_ros.robot import catalogue, dynamics
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -154,7 +154,7 @@ def plain(consumer):
 @pytest.mark.parametrize('name', CATALOGUE)
 @pytest.mark.parametrize('consumer', OUTPUTS)
 def test_a_consumer_applies_an_effect_or_states_why_not(consumer, name):
-    reason, robot = effects.ignored(consumer, name), with_effect(name)
+    reason, robot = catalogue.ignored(consumer, name), with_effect(name)
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](robot)])
     changed = found.shape != plain(consumer).shape or not np.array_equal(found, plain(consumer))
     assert changed != bool(reason), reason or f'{name} changes nothing'
@@ -162,4 +162,4 @@ def test_a_consumer_applies_an_effect_or_states_why_not(consumer, name):
 
 @pytest.mark.parametrize('name', CATALOGUE)
 def test_the_gap_finder_applies_every_effect(name):
-    assert gap(name) != bool(effects.ignored('gap', name))
+    assert gap(name) != bool(catalogue.ignored('gap', name))

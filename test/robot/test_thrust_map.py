@@ -6,7 +6,8 @@ from hypothesis import given, settings, strategies
 import numpy as np
 import pytest
 
-from beetle_omni_ros.robot.parameters import RobotParameters, RotorMapRow
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parts import RotorMapRow
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.thrust_map import duty_of_command, FULL_DUTY, ThrustMap
 

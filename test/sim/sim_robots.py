@@ -33,9 +33,13 @@ def plant(robot=ROBOT, position=HIGH, quaternion=LEVEL, variation=None):
     return made
 
 
-def acceleration(made, position, quaternion, velocity, rate, tilt, tilt_rate, thrust):
+def acceleration(made, position, quaternion, velocity, rate, tilt, tilt_rate, thrust,
+                 command=None):
     """Accelerations (10,) of a state whose tilts are their targets, away from the floor."""
     made.reset(position, quaternion, [*velocity, *rate, *tilt_rate], tilt, thrust)
+    if command is not None:     # thrusts [N] to which the rotors are on their way
+        made.set_targets(tilt, command)
+        made._update()
     return made.data.qacc.copy()
 
 

@@ -1,17 +1,22 @@
 """
-MuJoCo's plant and the CasADi model describe the same rigid body.
+The plant, in MuJoCo and numpy, and the CasADi model agree; each has its own equations.
 
-Wind and drag have the same equations in both; here they show frames and points of application.
+Each effect is compared but for the friction of the servos, whose law both take from
+:mod:`robot.servo`, and ``module_reaction``: there the plant has bodies and the model approximates
+them (``benchmarks/multibody_difference.py`` has the difference).
 """
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from sim_robots import acceleration, massless_modules, plant, ROBOT
 
-from beetle_omni_ros.robot.dynamics import body_acceleration
+from beetle_omni_ros.robot import dynamics
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.rotations import normalized
+from beetle_omni_ros.sim.forces import ServoLoads
 
 EFFECTS = {
     'none': {},
@@ -21,18 +26,40 @@ EFFECTS = {
     'thrust_coefficient': {'thrust_coefficient': {'scale': 0.93}},
     'rotor_thrust_coefficient': {'rotor_thrust_coefficient': {'scale': [1.0, 0.9, 1.05, 0.97]}},
     'torque_coefficient': {'torque_coefficient': {'torque_to_thrust_ratio': 0.021}},
+    'joint_offset': {'joint_offset': {'offset': [0.05, -0.1, 0.2, 0.03]}},
     'wind': {'wind': {'force': [1.0, -2.0, 0.5]}},
     'body_drag': {'body_drag': {'coefficient': 0.11}},
     'rotor_drag': {'rotor_drag': {'coefficient': 0.4}},
+    'rotor_hub_moment': {'rotor_hub_moment': {'coefficient': 0.1}},
+    'axial_inflow': {'axial_inflow': {'per_rotor': 0.4}},
+    'translational_lift': {'translational_lift': {'per_rotor': 0.03}},
+    'tilt_thrust_loss': {'tilt_thrust_loss': {'loss_at_60deg': 0.06, 'cosine_share': 0.3}},
+    'ground_effect': {'ground_effect': {'gain_at_0.25m': 0.2, 'exponential_share': 0.4}},
+    'propeller_gyroscopic_torque': {'propeller_gyroscopic_torque': {
+        'angular_momentum_at_hover': 0.066, 'spin_up_share': 0.7}},
+    'rotor_acceleration_torque': {'rotor_acceleration_torque': {
+        'angular_momentum_at_hover': 0.05}},
+    'voltage_sag': {'voltage_sag': {'exponent': 1.3}},
 }
 EFFECTS['all'] = {name: values for each in EFFECTS.values() for name, values in each.items()}
+SERVOS = {'joint_deflection': {'deflection_per_newton': 0.002},
+          'propeller_gyroscopic_torque': {'angular_momentum_at_hover': 0.066, 'joint_share': 0.8}}
+NOT_COMPARED = {'joint_friction', 'module_reaction'}    # see above
+VOLTAGE_RATIO = 0.87
+LOW, HIGH = 0.6, 10.0       # [m], the lower in reach of the ground effect
 
 
-def random_states(count, seed):
+def test_every_effect_with_an_equation_is_compared_or_named():
+    assert {*EFFECTS['all'], *SERVOS, *NOT_COMPARED} == {
+        name for name, effect in CATALOGUE.items() if effect.apply or effect.servo}
+
+
+def random_states(count, seed, height=HIGH):
     """States anywhere in the flight envelope, away from the floor and the stops."""
     generator = np.random.default_rng(seed)
     for _ in range(count):
-        yield (generator.normal(size=3) + [0, 0, 10], normalized(generator.normal(size=4)),
+        yield (generator.normal(size=3) * [1, 1, 0.1] + [0, 0, height],
+               normalized(generator.normal(size=4)),
                generator.normal(size=3) * 3, generator.normal(size=3) * 3,
                generator.uniform(-3.9, 3.9, 4), generator.uniform(-9, 9, 4),
                generator.uniform(0.5, 20, 4))
@@ -46,12 +73,32 @@ def difference(found, expected):
     *(massless_modules(effects=effects) for effects in EFFECTS.values()),
     replace(ROBOT, multibody=None)], ids=[*EFFECTS, 'not described'])
 def test_plant_without_module_inertia_agrees_with_casadi(robot):
-    made, model = plant(robot), body_acceleration(robot)
-    for p, q, v, w, tilt, tilt_rate, thrust in random_states(40, seed=1):
-        linear, angular = model(v, q, w, tilt, thrust)
-        found = acceleration(made, p, q, v, w, tilt, tilt_rate, thrust)
-        assert difference(found[:3], np.array(linear).ravel()) < 1e-6
-        assert difference(found[3:6], np.array(angular).ravel()) < 1e-6
+    made, generator = plant(robot), np.random.default_rng(2)
+    made.voltage_ratio = VOLTAGE_RATIO
+    for p, q, v, w, tilt, tilt_rate, thrust in [*random_states(20, seed=1),
+                                                *random_states(20, seed=2, height=LOW)]:
+        command = generator.uniform(0.5, 20, 4)
+        found = acceleration(made, p, q, v, w, tilt, tilt_rate, thrust, command)
+        scale = robot.thrust_scale
+        expected = ca.evalf(ca.vertcat(*dynamics.rigid_body(
+            robot, v, ca.DM(q), ca.DM(w), ca.DM(tilt), ca.DM(thrust), tilt_rate=ca.DM(tilt_rate),
+            thrust_rate=ca.DM(scale * (command - thrust) / robot.rotors.time_constant),
+            position=ca.DM(p), voltage_ratio=ca.DM(VOLTAGE_RATIO))))
+        linear, angular = np.split(np.array(expected).ravel(), 2)
+        assert difference(found[:3], linear) < 1e-6
+        assert difference(found[3:6], angular) < 1e-6
+
+
+def test_loads_of_the_servos_agree_with_the_model():
+    robot = replace(ROBOT, effects=SERVOS)
+    loads = ServoLoads(robot)
+    for _, _, _, rate, tilt, _, thrust in random_states(20, seed=4):
+        targets, torques = loads(tilt + 0.1, tilt, rate, thrust)
+        for i in range(4):
+            gyroscopic = dynamics.gyroscopic_load(robot, rate, tilt[i], thrust[i], i)
+            _, terms = dynamics.tilt_servo(robot, i, tilt[i] + 0.1, thrust[i], float(gyroscopic))
+            assert targets[i] == pytest.approx(terms.target, rel=1e-12)
+            assert torques[i] == pytest.approx(terms.load, rel=1e-6)
 
 
 @pytest.mark.parametrize('effects', [

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sim_robots import plant, WORLD
 
+from beetle_omni_ros.control.policy_file import robot_hash, TRAINED_FOR
 from beetle_omni_ros.robot import dynamics
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.train import model
@@ -155,3 +156,25 @@ def test_training_physics_are_those_of_the_multibody_plant(tilt_step, thrust_ste
     assert rms(with_modules[:, rate] - true[:, rate]) < 0.5 * rms(without[:, rate] - true[:, rate])
     ours, theirs = (rms(angle(x[:, 6:10], true[:, 6:10])) for x in (with_modules, without))
     assert ours < theirs * (0.3 if tilt_step == 0 else 0.95)
+
+
+def trained_with(robot):
+    """Model of the training environment and its nominal quantities."""
+    return model.substep(robot, 0.0025).serialize(), tuple(model.nominal_body(robot))
+
+
+def with_value(part, path, change):
+    """``part`` with the value at a dotted path changed."""
+    name, _, rest = path.partition('.')
+    old = getattr(part, name)
+    return replace(part, **{name: with_value(old, rest, change) if rest else change(old)})
+
+
+@pytest.mark.parametrize('key', [key for key in TRAINED_FOR if key != 'effects'] + [
+    'battery.resistance', 'multibody.end_effector.mass', 'multibody.module.joint_height',
+    'multibody.module.rotor_offset', 'rotors.map'])
+def test_the_hash_of_a_policy_covers_what_its_training_environment_uses(key):
+    changes = {'rotors.spin': lambda value: -value, 'rotors.map': lambda value: value[1:]}
+    robot = with_value(ROBOT, key, changes.get(key, lambda value: value * 1.001 + 1e-6))
+    assert (robot_hash(robot) != robot_hash(ROBOT)) == (key in TRAINED_FOR)
+    assert (trained_with(robot) != trained_with(ROBOT)) == (key in TRAINED_FOR)

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.robot.effects import CATALOGUE, delaying, ignored
+from beetle_omni_ros.robot.catalogue import delaying, ignored
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.terms import EffectParameter
 

@@ -23,7 +23,8 @@ from beetle_omni_ros.identify.gap.series import (
     within,
 )
 from beetle_omni_ros.identify.recording.signals import white_noise
-from beetle_omni_ros.robot.effects import CATALOGUE, ignored
+from beetle_omni_ros.robot.catalogue import ignored
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import play
 

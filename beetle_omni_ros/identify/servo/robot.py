@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.servo.model import INDEX, NAMES, OFF, TERMS
-from beetle_omni_ros.robot.effects import delaying, per_joint
+from beetle_omni_ros.robot.catalogue import delaying
+from beetle_omni_ros.robot.effects import per_joint
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import load_yaml
