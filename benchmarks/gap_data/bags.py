@@ -22,9 +22,10 @@ TABLES = {
 
 def write_bag(path: str | Path, recording: dict[str, np.ndarray], *, epoch: int) -> None:
     """Write a :func:`~gap_data.sensors.measure`; ``epoch``: UNIX time of its beginning [s]."""
-    entries = [(float(row[0]) + age, topic, message(float(row[0]), *(row[part] for part in parts)))
+    entries = [(epoch + float(row[0]) + age, topic,
+                message(epoch + float(row[0]), *(row[part] for part in parts)))
                for table, (topic, message, parts, age) in TABLES.items()
                for row in recording[table]]
-    with BagWriter(path, topics=[topic for topic, *_ in TABLES.values()], epoch=epoch) as bag:
+    with BagWriter(path, topics=[topic for topic, *_ in TABLES.values()]) as bag:
         for received, topic, value in sorted(entries, key=lambda entry: entry[0]):
             bag.write(topic, value, received)
