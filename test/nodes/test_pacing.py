@@ -7,7 +7,6 @@ import pytest
 
 from beetle_omni_ros.nodes.sim_node import (
     CATCH_UP_TICKS,
-    LAG,
     PATIENCE,
     RealTimePacing,
     SimulatedTimePacing,
@@ -69,9 +68,27 @@ def fly(waiting, clock, seconds, answers):
 
 def test_simulated_time_continues_while_all_nodes_answer_or_none_has_yet(waiting, clock):
     fly(waiting, clock, 1.0, lambda k: None)
-    fly(waiting, clock, 1.0, lambda k: waiting.now - 0.5 * LAG)
+    fly(waiting, clock, 1.0, lambda k: waiting.now)
     assert waiting.ticks == 400
     assert waiting.now == pytest.approx(ROS + 2.0)
+
+
+def test_simulated_time_waits_for_an_answer_as_long_as_its_interval_says_that_it_is_due(
+        waiting, clock):
+    fly(waiting, clock, 0.02, lambda k: ROS + 0.01 * (k // 2))      # an answer each 10 ms
+    ticks = waiting.ticks
+    fly(waiting, clock, 10 * TICK, lambda k: None)      # the next one is due and does not come
+    assert waiting.ticks - ticks <= 2
+    waiting.answered('odom', waiting.sent)
+    assert waiting.due() == 1
+
+
+def test_simulated_time_stands_still_at_a_pause(waiting, clock):
+    waiting.pause_at = 0.1
+    fly(waiting, clock, 1.0, lambda k: waiting.now)
+    assert waiting.now == pytest.approx(ROS + 0.1)
+    waiting.pause_at = 1e9
+    assert waiting.due() == 1
 
 
 def test_simulated_time_waits_once_for_each_silence_of_a_node(waiting, clock):
