@@ -74,11 +74,12 @@ def loses_one_node_after_another(graph, witness, bag):
     assert witness.wait(lambda: witness.state == 'fallback', 2)
     assert witness.stays_in_the_air(1.5)
     assert np.linalg.norm(witness.truth.velocity) < 0.5
-    assert 'nmpc_node silent' in graph.log('supervisor_node').read_text()
+    assert witness.wait(lambda: 'nmpc_node silent' in graph.log('supervisor_node').read_text(), 5)
 
     graph.kill('ekf_node')
-    assert witness.wait(lambda: witness.state == 'landing', 2)
-    assert 'ekf_node silent' in graph.log('supervisor_node').read_text()
+    assert witness.wait(lambda: witness.state == 'landing', 5), witness.states
+    # the state is published before the line is logged
+    assert witness.wait(lambda: 'ekf_node silent' in graph.log('supervisor_node').read_text(), 5)
     sinking = []
     assert witness.wait(lambda: sinking.append(witness.truth.velocity[2])
                         or witness.state == 'disarmed', 15)
