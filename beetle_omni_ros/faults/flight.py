@@ -19,6 +19,7 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.evaluation.campaign import flight_key
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.mode import DISARMED, FALLBACK, FLYING, MOTORS_OFF
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.log import Recorder
@@ -46,8 +47,7 @@ EFFECTS = {     # of the plant of healthy flights; sizes of docs/gap.md
     'wind': {'force': [1.0, 0.0, 0.0]}, 'ground_effect': {'gain_at_0.25m': 0.08},
     'command_latency': {'delay': 0.01}}                                 # half the size
 FRESH = 0.5     # [-] charge below which the pack is replaced before the next pose
-OFF = ('disarmed', 'emergency_stop')
-IN_FLIGHT = ('flying', 'fallback')
+AIRBORNE = (FLYING, FALLBACK)     # states without a landing
 # Expected outcome -> outcomes that are equal or better.
 BETTER = {'flies_on': ('flies_on', 'refused'), 'lands': ('flies_on', 'refused', 'lands'),
           'stops': ('flies_on', 'refused', 'lands', 'stops'), 'refused': ('refused',)}
@@ -163,7 +163,7 @@ def _fly_fault(trial, case, recorder, plan):
         left -= period
         if left > 0 and not over:
             flight.aim_randomly()
-    asked = flight.supervisor.state in IN_FLIGHT
+    asked = flight.supervisor.state in AIRBORNE
     if not over:
         flight.land(watcher)
     seen = watcher.observed(asked=asked)
@@ -188,17 +188,17 @@ def _fly_healthy(trial, recorder, plan):
     flight = Flight(trial, HEALTHY, plan, recorder)
     simulator, supervisor = flight.simulator, flight.supervisor
     start = simulator.time
-    while simulator.time - start < plan.healthy_time and supervisor.state in IN_FLIGHT:
+    while simulator.time - start < plan.healthy_time and supervisor.state in AIRBORNE:
         if simulator.battery.charge < FRESH:
             simulator.battery.reset()
         flight.aim_randomly()
         flight.fly(plan.pose_time)
-    flight.land(lambda: supervisor.state == 'disarmed')
+    flight.land(lambda: supervisor.state == DISARMED)
     epoch = flight.loop.epoch
     alarms = [[event.stamp - epoch, event.severity, event.text] for event in flight.loop.events
               if event.severity != INFO]
     alarms += [[stamp - epoch, 'fault', name] for name, stamp in supervisor.faults.items()]
-    landed = supervisor.state == 'disarmed'
+    landed = supervisor.state == DISARMED
     return {'flown_s': simulator.time - start, 'state': supervisor.state, 'alarms': alarms,
             'outcome': 'flies_on' if landed else 'does not land', 'good': landed and not alarms}
 
@@ -279,7 +279,7 @@ class Watcher:
         if not self.named[0]:
             self.named = next(((name, simulator.time - self._start) for name in supervisor.faults
                                if name not in self._past_faults), self.named)
-        ended = supervisor.state in OFF or truth.broken
+        ended = supervisor.state in MOTORS_OFF or truth.broken
         self._still = self._still + tick if ended else 0.0
         return self.flyaway or self._still >= self._plan.end_time
 
@@ -315,7 +315,7 @@ class Watcher:
 
     def outcome(self, asked: bool) -> str:
         """Outcome of the flight as one word of :data:`.page.OUTCOMES`."""
-        stopped = self._flight.supervisor.state in OFF
+        stopped = self._flight.supervisor.state in MOTORS_OFF
         if self.flyaway:
             return 'flyaway'
         if self.takeoffs:

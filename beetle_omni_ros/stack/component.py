@@ -20,12 +20,13 @@ import numpy as np
 from beetle_omni_ros.messages.topics import Qos
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.safety.events import Answer
+from beetle_omni_ros.safety.supervisor import AGE_LIMIT
 
 OK, WARN, ERROR = range(3)      # of diagnostic_msgs/DiagnosticStatus
 DIAGNOSTICS_PERIOD = 1.0        # [s] between two reports of a component
 SILENCE = 0.5           # [s] without a message after which an expected topic has ended
 FUTURE = 0.05           # [s] ahead of the clock above which a stamp is refused
-COMMAND_AGE = 0.1       # [s] no older command is executed, by any actuator
+COMMAND_AGE = AGE_LIMIT     # [s] no older command is executed, by any actuator
 IDENTITY = 'supervisor/identity'
 TEXT_LIMIT = 40         # characters of a foreign identity in an error message
 
