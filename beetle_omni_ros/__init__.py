@@ -7,7 +7,7 @@ The functions for notebooks. Imports are delayed until a function is called::
 
     robot = bo.robot()                                    # parameters, from a file or shipped
     log = bo.simulate('nmpc', [[0, 0, 1, 90, 0, 0]])      # a flight as numpy arrays
-    loop = bo.flight('nmpc')                              # a robot in the air, to be stepped
+    loop = bo.simulation('nmpc')                          # a robot in the air, to be stepped
     table = bo.evaluate([MyController, 'rl'], 'waypoints')      # metrics, and a table in print
     log = bo.read_run('runs_out/flight')                  # a recorded bag as numpy arrays
     found = bo.find_gap(['flight1', 'flight2'])           # effects that the model lacks
@@ -17,20 +17,29 @@ The folder examples/ contains short examples.
 
 from __future__ import annotations
 
-from beetle_omni_ros import robot
-
 TYPE_CHECKING = False       # typing and pathlib would delay the start of every program
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
     from typing import Any
 
-    from beetle_omni_ros.robot.parameters import RobotParameters
-    from beetle_omni_ros.runs.log import FlightLog
-    from beetle_omni_ros.stack.loop import FlightLoop
+    from beetle_omni_ros.bags.log import FlightLog
+    from beetle_omni_ros.flight.loop import FlightLoop
+    from beetle_omni_ros.model.parameters import RobotParameters
 
 __version__ = '0.1.0'
-__all__ = ['evaluate', 'find_gap', 'flight', 'read_run', 'robot', 'simulate', 'trajectory']
+__all__ = ['evaluate', 'find_gap', 'read_run', 'robot', 'simulate', 'simulation', 'trajectory']
+
+
+def robot(file: str | Path | None = None) -> RobotParameters:
+    """
+    Read a robot file, by default the shipped params/robot.yaml.
+
+    ``dataclasses.replace`` derives another robot from the result,
+    :class:`~beetle_omni_ros.model.parameters.RobotParameters`.
+    """
+    from beetle_omni_ros.model.parameters import RobotParameters
+    return RobotParameters.load(file)
 
 
 def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
@@ -58,7 +67,7 @@ def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
         ParameterError, RunError: with a message of one line.
 
     """
-    from beetle_omni_ros.evaluation.command import fly
+    from beetle_omni_ros.flight.evaluate import fly
     believed, flown = _robot(robot), _task(task, seed)
     given = robot is None or robot is believed
     return fly(_reference(controller), flown, robot=believed,
@@ -68,10 +77,10 @@ def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
                    'robot': 'params/robot.yaml' if given else str(robot), 'version': __version__})
 
 
-def flight(controller: str | Callable = 'nmpc', *,
-           robot: RobotParameters | str | Path | None = None,
-           plant: RobotParameters | str | Path | None = None, conditions: str = 'nominal',
-           seed: int = 0) -> FlightLoop:
+def simulation(controller: str | Callable = 'nmpc', *,
+               robot: RobotParameters | str | Path | None = None,
+               plant: RobotParameters | str | Path | None = None, conditions: str = 'nominal',
+               seed: int = 0) -> FlightLoop:
     """
     Return a robot in the air with its flight stack, which the caller steps.
 
@@ -83,9 +92,9 @@ def flight(controller: str | Callable = 'nmpc', *,
         ParameterError, RunError: no take-off, with a message of one line.
 
     """
+    from beetle_omni_ros.bags.log import LogRecorder
     from beetle_omni_ros.control import registry
-    from beetle_omni_ros.runs.log import LogRecorder
-    from beetle_omni_ros.stack.loop import FlightLoop
+    from beetle_omni_ros.flight.loop import FlightLoop
     believed, entry = _robot(robot), registry.find(_reference(controller))
     recorder = LogRecorder({'controller': entry.name})
     made = FlightLoop(believed, believed if plant is None else _robot(plant),
@@ -112,7 +121,7 @@ def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any =
     """
     from rich.console import Console
 
-    from beetle_omni_ros.evaluation.command import run_evaluate
+    from beetle_omni_ros.flight.evaluate import run_evaluate
     several = [controllers] if isinstance(controllers, str) or callable(controllers) \
         else controllers
     return run_evaluate(
@@ -128,7 +137,7 @@ def read_run(path: str | Path) -> FlightLog:
     ``warnings`` of the flight list missing topics and damage. A ParameterError of one line refuses
     a file that is no bag.
     """
-    from beetle_omni_ros.runs.bag import read_bag
+    from beetle_omni_ros.bags.bag import read_bag
     return read_bag(path)
 
 
@@ -170,7 +179,7 @@ def trajectory(times, positions, quaternions, name: str = 'own trajectory'):
         name: in result tables.
 
     """
-    from beetle_omni_ros.runs.tasks import trajectory_task
+    from beetle_omni_ros.control.tasks import trajectory_task
     return trajectory_task(name, times, positions, quaternions)
 
 
@@ -185,14 +194,14 @@ def _reference(controller):
 
 
 def _robot(given):
-    from beetle_omni_ros.robot.parameters import RobotParameters
+    from beetle_omni_ros.model.parameters import RobotParameters
     return given if isinstance(given, RobotParameters) else RobotParameters.load(given)
 
 
 def _task(given, seed):
     from pathlib import Path
 
-    from beetle_omni_ros.runs.tasks import make_task, poses_task, Task
+    from beetle_omni_ros.control.tasks import make_task, poses_task, Task
     if isinstance(given, Task):
         return given
     return make_task(given, seed) if isinstance(given, (str, Path)) else \

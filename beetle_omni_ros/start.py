@@ -23,7 +23,7 @@ def run(name: str) -> int | None:
     if handled:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     main = import_module(f'{PACKAGE}.cli').main if name == TOOL else partial(
-        import_module(f'{PACKAGE}.nodes.runner').main, name)
+        import_module(f'{PACKAGE}.ros.runner').main, name)
     try:
         if handled:
             signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -24,8 +24,8 @@ from rich.table import Table
 from rsl_rl.algorithms import PPO
 import torch
 
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.train.batch import PERIOD
 from beetle_omni_ros.train.command import choose_device
 from beetle_omni_ros.train.environment import SUBSTEPS, TiltableQuadrotorEnv

@@ -28,7 +28,7 @@ from gap_data.cases import DIFFICULTIES, KINDS, load_settings, make_cases  # noq
 from gap_data.effects import CATALOGUE, OUTSIDE  # noqa: E402
 from gap_data.score import markdown, score  # noqa: E402
 
-from beetle_omni_ros.evaluation.campaign import workers  # noqa: E402
+from beetle_omni_ros.flight.campaign import workers  # noqa: E402
 
 TOOL = f'{sys.executable} -m beetle_omni_ros.cli'
 

@@ -30,8 +30,8 @@ from beetle_omni_ros.identify.flights.priors import keys_of
 from beetle_omni_ros.identify.flights.table import Format
 from beetle_omni_ros.identify.flights.table_verdict import load_tables
 from beetle_omni_ros.identify.gap.command import gap_results
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.resources import share_path
 
 BUILD = 'NanoBench-state-A'
 ROBOT = share_path('params/crazyflie.yaml')

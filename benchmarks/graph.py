@@ -30,10 +30,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from beetle_omni_ros.nodes.fly import run_fly
-from beetle_omni_ros.nodes.graph import BRIDGES, BRIDGES_COMPOSED, COMPOSED
-from beetle_omni_ros.nodes.runner import use_real_time_priority
-from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.bags.bag import read_bag
+from beetle_omni_ros.ros.fly import run_fly
+from beetle_omni_ros.ros.graph import BRIDGES, BRIDGES_COMPOSED, COMPOSED
+from beetle_omni_ros.ros.runner import use_real_time_priority
 
 # actuators -> targets
 ARRANGEMENTS = {

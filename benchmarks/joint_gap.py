@@ -29,7 +29,7 @@ from beetle_omni_ros.identify.servo.compare import compare, gap_of
 from beetle_omni_ros.identify.servo.joint import identify
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX, simulate
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
 COUNT = 2 * np.pi / 4096    # [rad] of the encoder

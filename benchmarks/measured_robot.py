@@ -28,15 +28,15 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import chi2
 
+from beetle_omni_ros.bags.metrics import metrics
 from beetle_omni_ros.control.registry import ControllerOptions
-from beetle_omni_ros.evaluation.campaign import workers
-from beetle_omni_ros.evaluation.command import fly
-from beetle_omni_ros.robot.allocation import Allocator
-from beetle_omni_ros.robot.degraded import sphere
-from beetle_omni_ros.robot.parameters import mass_properties, RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.metrics import metrics
-from beetle_omni_ros.runs.tasks import make_task
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.flight.campaign import workers
+from beetle_omni_ros.flight.evaluate import fly
+from beetle_omni_ros.model.allocation import Allocator
+from beetle_omni_ros.model.degraded import sphere
+from beetle_omni_ros.model.parameters import mass_properties, RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 
 POSES, POSE_TIME, OF_DRAWN = 15, 8.0, 10    # of a flight; [s]; poses of a drawn robot
 DRAWN, UNMET = 'drawn', 'unmet'

@@ -12,9 +12,9 @@ import argparse
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.dynamics import body_acceleration
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.dynamics import body_acceleration
+from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant
 

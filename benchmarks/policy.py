@@ -27,13 +27,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from beetle_omni_ros.bags.log import LogRecorder
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.log import LogRecorder
-from beetle_omni_ros.runs.tasks import make_task
-from beetle_omni_ros.stack.loop import FlightLoop
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.flight.loop import FlightLoop
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 
 TARGETS = {'median': 0.1, 'p99': 0.2}   # [ms] of inference
 

@@ -32,12 +32,12 @@ from beetle_omni_ros.control.base import Command, PoseTarget, State
 from beetle_omni_ros.control.guidance import Guidance, LAYERS
 from beetle_omni_ros.control.policy import PolicyParameters
 from beetle_omni_ros.control.policy_file import find, PolicyNetwork, session
-from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.tasks import pose_target, random_poses
+from beetle_omni_ros.control.tasks import pose_target, random_poses
+from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 from beetle_omni_ros.train.parameters import RandomParameters, StartParameters, TrainParameters
 

@@ -7,8 +7,8 @@ import time
 import numpy as np
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.simulator import Simulator

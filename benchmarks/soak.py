@@ -27,17 +27,17 @@ from rich.console import Console
 from rich.table import Table
 import yaml
 
-from beetle_omni_ros.nodes.graph import (
+from beetle_omni_ros.control.targets import COLUMNS
+from beetle_omni_ros.control.tasks import POSE_DURATION, WAYPOINTS
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.ros.graph import (
     bridge_parameters,
     BRIDGES,
     confine,
     Graph,
     reserved_domain,
 )
-from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.runs.targets import COLUMNS
-from beetle_omni_ros.runs.tasks import POSE_DURATION, WAYPOINTS
+from beetle_omni_ros.ros.operator import Operator
 
 PERIOD = 10.0           # s between two samples
 WARM_UP = 0.2           # share of the flight before the fit, at least:

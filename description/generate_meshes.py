@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from trimesh.creation import box, capsule, cylinder, icosphere
 
-from beetle_omni_ros.robot.parameters import mass_properties, RobotParameters
+from beetle_omni_ros.model.parameters import mass_properties, RobotParameters
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 OUTPUT = Path(__file__).parent / 'meshes'

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import (
+from beetle_omni_ros.model.parameters import (
     JOINT_NAMES,
     mass_properties,
     RobotParameters,

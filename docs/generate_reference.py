@@ -17,9 +17,9 @@ from textwrap import fill
 
 import numpy as np
 
-from beetle_omni_ros.messages import topics as message_topics
-from beetle_omni_ros.messages.topics import controller_of, TABLE
-from beetle_omni_ros.robot.resources import PACKAGE
+from beetle_omni_ros.bags import topics as message_topics
+from beetle_omni_ros.bags.topics import controller_of, TABLE
+from beetle_omni_ros.model.resources import PACKAGE
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / 'docs' / 'reference'
@@ -27,12 +27,12 @@ MADE = '<!-- Made by docs/generate_reference.py; changes by hand are lost. -->\n
 
 # Parameter file -> class that reads it, what it holds.
 FILES = {
-    'robot.yaml': ('robot.parameters:RobotParameters', 'The robot.'),
-    'robot_measured.yaml': ('robot.parameters:RobotParameters',
+    'robot.yaml': ('model.parameters:RobotParameters', 'The robot.'),
+    'robot_measured.yaml': ('model.parameters:RobotParameters',
                             'The robot as measured logs show it.'),
-    'robot_weak_and_heavy.yaml': ('robot.parameters:RobotParameters',
+    'robot_weak_and_heavy.yaml': ('model.parameters:RobotParameters',
                                   'A robot with less thrust and more mass than in robot.yaml.'),
-    'crazyflie.yaml': ('robot.parameters:RobotParameters',
+    'crazyflie.yaml': ('model.parameters:RobotParameters',
                        'A conventional quadrotor, for recordings of others.'),
     'nmpc.yaml': ('control.nmpc:NmpcParameters', 'The NMPC.'),
     'nmpc_published.yaml': ('control.nmpc:NmpcParameters',
@@ -47,10 +47,10 @@ FILES = {
                           'The policy of train_published.yaml.'),
     'hover.yaml': ('control.hover:HoverParameters', 'The hover controller.'),
     'ekf.yaml': ('estimation.parameters:EkfParameters', 'The estimator.'),
-    'supervisor.yaml': ('safety.parameters:SupervisorParameters',
+    'supervisor.yaml': ('supervisor.parameters:SupervisorParameters',
                         'Checks of commands, takeoff, landing, detection of faults.'),
-    'targets.yaml': ('runs.targets:TargetLimits', 'What a target pose must keep to.'),
-    'drive.yaml': ('drive:DriveParameters', 'Driving by hand.'),
+    'targets.yaml': ('control.targets:TargetLimits', 'What a target pose must keep to.'),
+    'drive.yaml': ('ros.drive:DriveParameters', 'Driving by hand.'),
     'servo_bus.yaml': ('drivers.device_parameters:ServoBusParameters', 'The bus of tilt servos.'),
     'motor_board.yaml': ('drivers.device_parameters:MotorBoardParameters',
                          'The motor board.'),
@@ -242,8 +242,8 @@ def _wrapped(text: str) -> str:
 
 def effects() -> str:
     """The catalogue of effects."""
-    from beetle_omni_ros.robot.catalogue import CONSUMERS, ignored
-    from beetle_omni_ros.robot.effects import CATALOGUE
+    from beetle_omni_ros.model.catalogue import CONSUMERS, ignored
+    from beetle_omni_ros.model.effects import CATALOGUE
     apart: dict[tuple, list] = {}
     for name in CATALOGUE:
         for key, consumer in CONSUMERS.items():
@@ -312,8 +312,8 @@ def _known(value) -> str:
 def python() -> str:
     """The public module and the classes of its results."""
     import beetle_omni_ros as module
+    from beetle_omni_ros.bags import log
     from beetle_omni_ros.control import base
-    from beetle_omni_ros.runs import log
     text = [f'# Python\n\n{MADE}\n{TIMES}']
     for name in module.__all__:
         found = getattr(module, name)

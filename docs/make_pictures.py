@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 import numpy as np
 
 import beetle_omni_ros as bo
+from beetle_omni_ros.bags.log import motion
 from beetle_omni_ros.identify.flights.page import picture_of
-from beetle_omni_ros.pages.figures import COLOURS, FAINT, STYLE
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.runs.log import motion
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.show.figures import COLOURS, FAINT, STYLE
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / 'docs' / 'tutorials' / 'pictures'
@@ -154,7 +154,7 @@ def real_gap():
 
 def hardware_flight():
     """Tilt angles and pack voltage of a flight through emulated devices."""
-    from beetle_omni_ros.nodes.fly import run_fly
+    from beetle_omni_ros.ros.fly import run_fly
     with tempfile.TemporaryDirectory() as name:
         poses = Path(name) / 'first.csv'
         poses.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,0\n0,0,1.2,45,0,0\n')

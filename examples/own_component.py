@@ -11,11 +11,11 @@ force with that of the commanded thrusts, and publishes the difference on 'obser
 
 import numpy as np
 
-from beetle_omni_ros.messages.topics import register, topic_like
-from beetle_omni_ros.messages.values import Wrench
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import Allocator
-from beetle_omni_ros.stack.component import Component
+from beetle_omni_ros.bags.topics import register, topic_like
+from beetle_omni_ros.bags.values import Wrench
+from beetle_omni_ros.flight.component import Component
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.allocation import Allocator
 
 register(topic_like('disturbance', 'observer/force', 'external force in world, estimated'))
 SMOOTHING = 0.2     # [s] time constant

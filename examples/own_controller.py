@@ -12,8 +12,8 @@ import numpy as np
 
 import beetle_omni_ros
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.allocation import Allocator
 
 
 class PoseController:

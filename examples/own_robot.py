@@ -11,7 +11,7 @@ import sys
 import tempfile
 
 import beetle_omni_ros
-from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.model.resources import share_path
 
 ROBOT = """\
 extends: {base}

@@ -57,8 +57,8 @@ SIGNALLED = 128     # status of a shell for a process that a signal ended, plus 
 
 def actions(context):
     """Turn the arguments into processes; ParameterError names an unusable argument."""
-    from beetle_omni_ros.nodes import graph
-    from beetle_omni_ros.robot.schema import ParameterError
+    from beetle_omni_ros.model.schema import ParameterError
+    from beetle_omni_ros.ros import graph
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     for name in FILES:
         if given[name] and not Path(given[name]).is_file():
@@ -93,7 +93,7 @@ def on_exit(name, codes, event, context):
 
     The robot lands without the bridges, so they end the launch only if they could not start.
     """
-    from beetle_omni_ros.nodes import graph, runner
+    from beetle_omni_ros.ros import graph, runner
     codes.append(event.returncode)
     if not context.is_shutdown and (
             name == graph.COMPOSED or event.returncode == runner.UNUSABLE):

@@ -35,7 +35,7 @@ STALL = 0.05        # s; the limits of silence in these tests are 50 to 80 ms
 MARKS = {'alone': re.compile(r'\bmark\.alone\b'),      # part of the suite -> in a file of it
          'real_time': re.compile(r'\bmark\.(real_time|alone)\b')}
 # Files of tests that wait for other processes, with timeouts; all others only compute.
-PROCESSES = re.compile(r'/(nodes|tutorials|view|pages)/test_\w+\.py$'
+PROCESSES = re.compile(r'/(ros|tutorials|show)/test_\w+\.py$'
                        r'|/test_(start|workers)\.py$')
 LANES = 'processes', 'computing'
 BEAT, BEGIN = pytest.StashKey(), pytest.StashKey[float]()
@@ -70,7 +70,7 @@ def pytest_collection_modifyitems(config, items):
         item.add_marker(_lane(item.path))
     if config.getoption('markexpr').startswith('real_time'):
         # First devices, which mostly wait; then processes of nodes, which compute.
-        items.sort(key=lambda item: item.path.parent.name == 'nodes')
+        items.sort(key=lambda item: item.path.parent.name == 'ros')
     else:       # The longest file first: at the end it would leave other workers idle.
         items.sort(key=lambda item: item.path.parent.name != 'tutorials')
     # A repetition beside other tests is of little use in real time; .ci/test repeats alone.

@@ -8,8 +8,8 @@ import pytest
 from synthetic_flights import write_imu
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.runs.bag_writer import BagWriter
+from beetle_omni_ros.bags.bag_writer import BagWriter
+from beetle_omni_ros.model.resources import share_path
 
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
 JOINTS = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad\n'

@@ -11,8 +11,8 @@ from synthetic_flights import fly
 
 import beetle_omni_ros
 from beetle_omni_ros import cli
-from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.tasks import make_task
+from beetle_omni_ros.bags.bag_writer import BagWriter
+from beetle_omni_ros.control.tasks import make_task
 
 ROOT = Path(__file__).parents[1]
 

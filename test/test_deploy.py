@@ -7,8 +7,8 @@ import subprocess
 
 import pytest
 
-from beetle_omni_ros.nodes import graph
-from beetle_omni_ros.nodes.graph import AUTOSTART
+from beetle_omni_ros.ros import graph
+from beetle_omni_ros.ros.graph import AUTOSTART
 
 ROOT = Path(__file__).resolve().parents[1]
 DEPLOY = ROOT / 'deploy'

@@ -12,7 +12,7 @@ import pytest
 import beetle_omni_ros
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, PoseTarget
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model.schema import ParameterError
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / 'examples'
@@ -56,7 +56,7 @@ def test_an_own_robot_flies_with_known_and_unknown_parameters(poses):
 
 
 def test_a_flight_can_be_stepped_by_the_caller():
-    loop = beetle_omni_ros.flight('hover')
+    loop = beetle_omni_ros.simulation('hover')
     loop.aim(PoseTarget(np.array([0.2, 0.0, 1.2]), np.array([0, 0, 0, 1.0])))
     end = loop.simulator.time + 4.0
     while loop.simulator.time < end:

@@ -4,12 +4,12 @@ import numpy as np
 from synthetic_flights import fly
 from test_packaging import parameter_classes
 
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import read_bag
-from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.tasks import make_task
-from beetle_omni_ros.view.report import make_page, make_runs, results_of
+from beetle_omni_ros.bags.bag import read_bag
+from beetle_omni_ros.bags.bag_writer import BagWriter
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.show.report import make_page, make_runs, results_of
 
 LONGEST_TEXT = 2000     # characters of a refusal
 LAUGHS = ['a: &a [x, x, x, x, x, x, x, x, x]', *(

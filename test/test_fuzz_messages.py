@@ -4,13 +4,13 @@ from dataclasses import fields, is_dataclass
 
 import numpy as np
 
+from beetle_omni_ros.bags.topics import ALL
+from beetle_omni_ros.bags.values import MessageError
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
-from beetle_omni_ros.messages.topics import ALL
-from beetle_omni_ros.messages.values import MessageError
-from beetle_omni_ros.robot.body import BodyState
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.readings import BatteryReading, JointReading, PoseReading
-from beetle_omni_ros.runs.targets import TargetChecks
+from beetle_omni_ros.control.targets import TargetChecks
+from beetle_omni_ros.model.body import BodyState
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.readings import BatteryReading, JointReading, PoseReading
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 NUMBERS = (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-320, 0.0, -5.0, 1e6)

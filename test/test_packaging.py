@@ -13,7 +13,7 @@ import pytest
 
 import beetle_omni_ros
 from beetle_omni_ros import start
-from beetle_omni_ros.robot.resources import PACKAGE, share_path
+from beetle_omni_ros.model.resources import PACKAGE, share_path
 
 ROOT = Path(__file__).resolve().parents[1]
 MANIFEST = ElementTree.parse(ROOT / 'package.xml').getroot()
@@ -79,7 +79,7 @@ def test_every_executable_has_its_function(setup_arguments):
         if program == start.TOOL:
             assert callable(import_module(f'{PACKAGE}.cli').main), script
         elif HAS_ROS and program != 'composed':     # which names its nodes
-            assert callable(import_module(f'{PACKAGE}.nodes.runner').maker(program)), script
+            assert callable(import_module(f'{PACKAGE}.ros.runner').maker(program)), script
 
 
 def test_every_folder_of_code_is_installed(setup_arguments):

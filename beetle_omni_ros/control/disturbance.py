@@ -13,11 +13,11 @@ import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped
-from beetle_omni_ros.robot.native import buffered
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model.allocation import ActuatorHealth, ALL_HEALTHY, clipped
+from beetle_omni_ros.model.native import buffered
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import parameter
 
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
 SHORT = 0.002           # [s] a command change nearer to an end of a span is treated as at this end

@@ -13,8 +13,8 @@ import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.turns import level_between, route
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.schema import ParameterError, quoted
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.schema import ParameterError, quoted
 
 LAYERS = 'unwinding', 'routing', 'trimming'
 # Unwinding

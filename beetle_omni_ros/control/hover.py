@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped, nearest_turn
-from beetle_omni_ros.robot.degraded import allocator, bounded_step, DegradedAllocator
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.rotations import shortened
-from beetle_omni_ros.robot.schema import parameter, ParameterFile
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.allocation import ActuatorHealth, ALL_HEALTHY, clipped, nearest_turn
+from beetle_omni_ros.model.degraded import allocator, bounded_step, DegradedAllocator
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.rotations import shortened
+from beetle_omni_ros.model.schema import parameter, ParameterFile
 
 LONGEST_STEP = 0.1   # [s] between two states from which an acceleration is computed
 PAUSE = 0.05         # [s] between two steps, after which the first is as long as one period

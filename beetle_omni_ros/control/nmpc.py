@@ -9,11 +9,11 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator, Disturbanc
 from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.ocp import Rti, WEIGHTS
 from beetle_omni_ros.control.references import ReferencePlanner
-from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot import native
-from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import group, parameter, ParameterError, ParameterFile, RunError
+from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model import native
+from beetle_omni_ros.model.allocation import ActuatorHealth, ALL_HEALTHY, clipped
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import group, parameter, ParameterError, ParameterFile, RunError
 
 FIRST_ITERATIONS = 5     # from a cold start, before the first command
 NARROW = 1e-3            # [rad or N] between bounds of a failed actuator; the QP needs an interior

@@ -14,10 +14,10 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.robot import dynamics
-from beetle_omni_ros.robot.native import built, generated
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model import dynamics
+from beetle_omni_ros.model.native import built, generated
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 
 FOLDER = Path(ca.__file__).resolve().parent
 OPTIONS = (f'-I{FOLDER}/include', f'-L{FOLDER}', '-l:libhpipm.so', '-l:libblasfeo.so.0', '-lm',

@@ -8,9 +8,9 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
 from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.policy_file import PolicyNetwork
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.rotations import entries
-from beetle_omni_ros.robot.schema import parameter, ParameterFile
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.rotations import entries
+from beetle_omni_ros.model.schema import parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
 LATEST = 10             # steps within which a command is reported as the executed command
@@ -55,7 +55,7 @@ class PolicyController:
         self._estimator = None
         if contract.memory:
             from beetle_omni_ros.control import disturbance
-            from beetle_omni_ros.robot.dynamics import integrator
+            from beetle_omni_ros.model.dynamics import integrator
             # The disturbance of another robot is its difference from that of the training.
             known = contract.trained_robot(robot)
             self._estimator = disturbance.DisturbanceEstimator(

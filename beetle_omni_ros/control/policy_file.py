@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.robot.catalogue import ignored
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES, value_of
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import nest, ParameterError, quoted, shortened
+from beetle_omni_ros.model.catalogue import ignored
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES, value_of
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import nest, ParameterError, quoted, shortened
 
 log = logging.getLogger(__name__)
 FORMAT = 'beetle_omni_policy/1'

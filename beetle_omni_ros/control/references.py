@@ -5,12 +5,12 @@ import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
 from beetle_omni_ros.control.ocp import REFERENCE_SIZE
-from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator
-from beetle_omni_ros.robot.degraded import allocator
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.allocation import ActuatorHealth, Allocator
+from beetle_omni_ros.model.degraded import allocator
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
 
 DIFFERENCE_STEP = 1e-3  # [s] for the reference's acceleration
 HALF_TURN = 0.5         # [rad] from half a turn of a joint, where errors decide its direction:

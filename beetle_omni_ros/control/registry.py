@@ -19,12 +19,12 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from beetle_omni_ros.control.base import Controller, error_text, reach_of
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model import schema
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import ParameterError
 
 if TYPE_CHECKING:       # imports CasADi, which a list of names does not need
-    from beetle_omni_ros.robot.parameters import RobotParameters
+    from beetle_omni_ros.model.parameters import RobotParameters
 
 LONGEST_PERIOD = 1.0        # [s]
 METHODS = {'step': ('state', 'target'), 'reset': ()}     # and their arguments

@@ -1,1 +1,1 @@
-"""Drivers of the servo bus and of the motor board, without ROS."""
+"""Drivers of the servo bus and of the motor board, and the check before a flight."""

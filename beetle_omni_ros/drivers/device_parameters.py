@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.drivers.servo_registers import BAUD_RATES
-from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile
+from beetle_omni_ros.model.schema import parameter, ParameterError, ParameterFile
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,10 +15,10 @@ from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.mavlink import BOARD, common, HOST, MavlinkReceiver, restarted
 from beetle_omni_ros.drivers.motor_board_state import BoardState, RotorStates
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
-from beetle_omni_ros.robot.mode import DISARMED, Mode, MOTORS_OFF
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.readings import BatteryReading
-from beetle_omni_ros.robot.thrust_map import ThrustMap
+from beetle_omni_ros.model.mode import DISARMED, Mode, MOTORS_OFF
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.readings import BatteryReading
+from beetle_omni_ros.model.thrust_map import ThrustMap
 
 TARGET_AGE = 0.1        # [s] of the oldest stamp of a target that is sent
 TICK = 0.01             # [s] longest sleep of the thread, a tenth of its shortest period

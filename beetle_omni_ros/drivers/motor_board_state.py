@@ -9,7 +9,7 @@ import time
 import numpy as np
 
 from beetle_omni_ros.drivers.mavlink import common
-from beetle_omni_ros.robot.readings import BatteryReading
+from beetle_omni_ros.model.readings import BatteryReading
 
 # The bytes of HEARTBEAT.custom_mode and COMMAND_ACK.result_param2.
 CONTRACT_VERSION = 1

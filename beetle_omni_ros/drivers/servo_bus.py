@@ -15,9 +15,9 @@ from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_link import ServoBusError, ServoLink
 from beetle_omni_ros.drivers.servo_registers import nearest_turns, TURN
-from beetle_omni_ros.robot.parameters import JOINT_NAMES
-from beetle_omni_ros.robot.parts import JointParameters
-from beetle_omni_ros.robot.readings import JointReading
+from beetle_omni_ros.model.parameters import JOINT_NAMES
+from beetle_omni_ros.model.parts import JointParameters
+from beetle_omni_ros.model.readings import JointReading
 
 # Current, velocity and position have consecutive addresses.
 FEEDBACK, FEEDBACK_LAYOUT = registers.PRESENT_CURRENT.address, struct.Struct('<hii')

@@ -8,7 +8,7 @@ import time
 import numpy as np
 
 from beetle_omni_ros.drivers.servo_bus import ServoBus
-from beetle_omni_ros.robot.readings import JointReading
+from beetle_omni_ros.model.readings import JointReading
 
 PERIOD = 0.005      # [s]
 STOP_TIMEOUT = 5.0  # [s] until the thread has ended; a cycle takes at most 0.02 s

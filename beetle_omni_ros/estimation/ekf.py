@@ -16,9 +16,9 @@ from beetle_omni_ros.estimation.inputs import DELAY_LIMIT, GAP, InputGuard, Nois
 from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import Estimate, Node, POSITION, propagate, SAME_INSTANT
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.readings import ImuReading, PoseReading
-from beetle_omni_ros.robot.rotations import geodesic_angle
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.readings import ImuReading, PoseReading
+from beetle_omni_ros.model.rotations import geodesic_angle
 
 __all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuReading', 'PoseReading']
 

@@ -7,8 +7,8 @@ from math import hypot, inf, isfinite, sqrt
 import numpy as np
 
 from beetle_omni_ros.estimation.parameters import EkfParameters, MocapParameters
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.readings import SpikeFilter
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.readings import SpikeFilter
 
 Checked = tuple[float, np.ndarray, np.ndarray]   # stamp and two vectors of a sample
 GAP = 0.1           # [s] longest bridged time between two IMU samples

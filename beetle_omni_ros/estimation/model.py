@@ -27,7 +27,7 @@ from beetle_omni_ros.estimation.state import (
     transition,
     VELOCITY,
 )
-from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.model import rotations
 
 MEASUREMENTS = 6  # position in world, rotation vector in base_link
 GATE = 0.99999          # share of good poses that passes the chi-square gate

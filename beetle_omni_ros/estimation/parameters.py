@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import group, parameter, ParameterFile
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,9 +18,9 @@ from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
 from beetle_omni_ros.identify.servo import page as of_joints
 from beetle_omni_ros.identify.servo.joint import identify, joint_results
 from beetle_omni_ros.identify.servo.log import read_joint_log
-from beetle_omni_ros.pages.page import page, print_grids, Terminal
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.files import write_json, write_text
+from beetle_omni_ros.model.files import write_json, write_text
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.show.page import page, print_grids, Terminal
 
 
 def run_identify_joint(paths: Sequence[Path], *, validate: Sequence[Path] = (),

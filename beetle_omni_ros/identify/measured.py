@@ -20,10 +20,10 @@ from beetle_omni_ros.identify.servo.fit import decoded, Found, HIGH, LOW, STARTS
 from beetle_omni_ros.identify.servo.log import HEADER, is_bag, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX
 from beetle_omni_ros.identify.servo.robot import catalogue_values, JOINTS, own_delay
-from beetle_omni_ros.robot.catalogue import settings
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters, TILT_LAG
-from beetle_omni_ros.runs.files import LogError
+from beetle_omni_ros.model.catalogue import settings
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.files import LogError
+from beetle_omni_ros.model.parameters import RobotParameters, TILT_LAG
 
 MILLI = 1e3
 # Standard deviation of the gains between logs, for intervals. From 0.1 to 0.4 it moves the gains

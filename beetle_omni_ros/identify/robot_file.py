@@ -4,10 +4,10 @@ from pathlib import Path
 
 import yaml
 
-from beetle_omni_ros.robot.parameters import find_robot
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.files import write_text
+from beetle_omni_ros.model.files import write_text
+from beetle_omni_ros.model.parameters import find_robot
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import ParameterError
 
 SHIPPED = 'robot.yaml'
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, make_dataclass, replace
 from pathlib import Path
 
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import (
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import (
     bind,
     load_yaml,
     parameter,

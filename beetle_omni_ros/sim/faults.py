@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.schema import bind, parameter, quoted, unknown
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.schema import bind, parameter, quoted, unknown
 
 ROUNDING = 1e-9     # [s] bound of the rounding error of sums of ticks
 READINGS = 'imu', 'mocap', 'joints', 'rotors', 'battery'        # attributes of a Frame

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.robot import dynamics, native, rotations
-from beetle_omni_ros.robot.effects import (
+from beetle_omni_ros.model import dynamics, native, rotations
+from beetle_omni_ros.model.effects import (
     CATALOGUE,
     EXPONENTIAL_HEIGHT,
     LEAST_HEIGHT,
     REFERENCE_HEIGHT,
 )
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 # Effects that only change a number of the plant's bodies, rotors and reaction torques.
 BUILT_IN = ('mass', 'inertia', 'centre_of_mass', 'module_reaction', 'thrust_coefficient',

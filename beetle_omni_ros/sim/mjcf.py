@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import combined, MassProperties, RigidPart, RobotParameters
+from beetle_omni_ros.model.parameters import combined, MassProperties, RigidPart, RobotParameters
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 BASE = 1                        # body index of base_link; 0 is the world

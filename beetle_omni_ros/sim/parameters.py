@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import RobotParameters, Variation
-from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile
+from beetle_omni_ros.model.parameters import RobotParameters, Variation
+from beetle_omni_ros.model.schema import parameter, ParameterError, ParameterFile
 
 RPM_AT_1_NEWTON = 2700.0    # [1/min] of a rotor; grows with the root of the thrust; chosen
 

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot import dynamics, rotations
-from beetle_omni_ros.robot.allocation import clipped
-from beetle_omni_ros.robot.parameters import mass_properties, RobotParameters, Variation
-from beetle_omni_ros.robot.schema import RunError
-from beetle_omni_ros.robot.servo import NUMPY
+from beetle_omni_ros.model import dynamics, rotations
+from beetle_omni_ros.model.allocation import clipped
+from beetle_omni_ros.model.parameters import mass_properties, RobotParameters, Variation
+from beetle_omni_ros.model.schema import RunError
+from beetle_omni_ros.model.servo import NUMPY
 from beetle_omni_ros.sim.forces import AddedForces, ServoLoads
 from beetle_omni_ros.sim.mjcf import BASE, build_model, CONTACT_TIME, set_payload
 from beetle_omni_ros.sim.parameters import SimulatorParameters

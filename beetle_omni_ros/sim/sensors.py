@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.robot import readings, rotations
-from beetle_omni_ros.robot.body import BodyState
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model import readings, rotations
+from beetle_omni_ros.model.body import BodyState
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.parameters import Conditions, RPM_AT_1_NEWTON, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant
 

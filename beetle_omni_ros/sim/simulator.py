@@ -8,10 +8,10 @@ from math import isfinite, sqrt
 
 import numpy as np
 
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import clipped
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.allocation import clipped
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.faults import Drive, Fault, READINGS, ROUNDING, Schedule
 from beetle_omni_ros.sim.parameters import draw, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW

@@ -2,7 +2,7 @@
 
 import torch
 
-from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.train.model import ARM, GAIN, MASS
 
 PERIOD = 0.01   # [s] between two entries of a history

@@ -7,9 +7,9 @@ from rich.console import Console
 import torch
 import yaml
 
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import nest, ParameterError, parse_yaml, quoted
-from beetle_omni_ros.runs.files import write_json
+from beetle_omni_ros.model.files import write_json
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import nest, ParameterError, parse_yaml, quoted
 from beetle_omni_ros.train.network import export_policy
 from beetle_omni_ros.train.parameters import read_parameters
 from beetle_omni_ros.train.runner import Runner

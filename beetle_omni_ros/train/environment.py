@@ -12,8 +12,8 @@ import torch
 
 from beetle_omni_ros.control import guidance
 from beetle_omni_ros.control.policy_file import PolicyContract
-from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.train import batch, rewards
 from beetle_omni_ros.train.model import (
     ARM,

@@ -12,9 +12,9 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.servo import CASADI, SLIDING_RATE, Step
+from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.servo import CASADI, SLIDING_RATE, Step
 
 # Quantities of each robot: mass [kg], inertia (3) [kg m^2], centre of mass (3) [m]; for the four
 # joints stiffness [N m/rad], damping [N m s/rad], Coulomb friction and stiction [N m] and play

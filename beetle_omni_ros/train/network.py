@@ -27,9 +27,9 @@ from beetle_omni_ros.control.policy_file import (
     PolicyContract,
     session,
 )
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import commit
-from beetle_omni_ros.robot.schema import ParameterError, RunError
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.resources import commit
+from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.train.parameters import TrainParameters
 
 OPSET = 18

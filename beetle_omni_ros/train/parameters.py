@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.robot.schema import (
+from beetle_omni_ros.model.schema import (
     bind,
     flatten,
     group,

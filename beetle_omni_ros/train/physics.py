@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import casadi as ca
 import torch
 
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.train import model
 
 BLOCK = 64    # robots in one program; small blocks use the GPU well with a few thousand robots

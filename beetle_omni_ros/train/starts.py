@@ -10,10 +10,10 @@ experience replay (2016).
 import numpy as np
 import torch
 
-from beetle_omni_ros.robot.allocation import Allocator
-from beetle_omni_ros.robot.degraded import sphere
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model.allocation import Allocator
+from beetle_omni_ros.model.degraded import sphere
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.train import batch
 from beetle_omni_ros.train.model import ACTUATORS, actuators, ARM, DAMPING, GAIN, LAG, nominal_body
 from beetle_omni_ros.train.parameters import STRATA, TrainParameters

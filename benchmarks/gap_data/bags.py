@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from beetle_omni_ros.bags.bag_writer import BagWriter
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
-from beetle_omni_ros.runs.bag_writer import BagWriter
+from beetle_omni_ros.model.readings import BatteryReading, ImuReading, JointReading, PoseReading
 
 # table of a recording -> topic, message, columns of its values, seconds from stamp to arrival
 TABLES = {

@@ -3,11 +3,11 @@
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import ALL_HEALTHY, Allocator
-from beetle_omni_ros.robot.native import buffered
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.allocation import ALL_HEALTHY, Allocator
+from beetle_omni_ros.model.native import buffered
+from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])

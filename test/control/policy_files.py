@@ -5,7 +5,7 @@ import onnx
 from onnx import helper, numpy_helper, TensorProto
 
 from beetle_omni_ros.control.policy_file import add_checksum, PolicyContract
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 
 def write(path, *, robot=None, memory=False, metadata=None, drop=(), weights=None, bias=None,

@@ -7,9 +7,9 @@ import pytest
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.degraded import FLYING_MARGIN, Holding
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.allocation import ActuatorHealth, ALL_HEALTHY
+from beetle_omni_ros.model.degraded import FLYING_MARGIN, Holding
 
 LOST = ActuatorHealth(rotors=(True, False, True, True))
 STUCK = ActuatorHealth(stuck=(None, None, 0.8, None))

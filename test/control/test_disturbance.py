@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from beetle_omni_ros.bags.log import LogRecorder
 from beetle_omni_ros.control.base import Command, PoseTarget, State
 from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc import NmpcController, NmpcParameters
-from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot.native import buffered
-from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
-from beetle_omni_ros.runs.log import LogRecorder
-from beetle_omni_ros.stack.loop import FlightLoop
+from beetle_omni_ros.flight.loop import FlightLoop
+from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model.native import buffered
+from beetle_omni_ros.model.parameters import find_robot, RobotParameters
 
 ROBOT = RobotParameters.load()
 HOVER = ROBOT.hover_thrust

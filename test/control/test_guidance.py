@@ -18,9 +18,9 @@ from beetle_omni_ros.control.guidance import (
     PATIENCE,
     Trimming,
 )
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 
 AXES = RobotParameters.load().tilt_axes
 GOAL = PoseTarget(np.array([0.4, -0.3, 1.5]), rotations.from_rpy(0.8, -0.5, 2.0), stamp=3.0)

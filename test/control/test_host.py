@@ -13,8 +13,8 @@ from beetle_omni_ros.control.base import (
     State,
     TrajectoryTarget,
 )
-from beetle_omni_ros.robot.allocation import ActuatorHealth
-from beetle_omni_ros.robot.mode import Mode
+from beetle_omni_ros.model.allocation import ActuatorHealth
+from beetle_omni_ros.model.mode import Mode
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 

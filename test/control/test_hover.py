@@ -13,9 +13,9 @@ from beetle_omni_ros.control.hover import (
     THRUST_RATE,
     TILT_RATE_SHARE,
 )
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import Allocator
-from beetle_omni_ros.safety.way import coasted, halting
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.allocation import Allocator
+from beetle_omni_ros.supervisor.way import coasted, halting
 
 TILT_RATE = TILT_RATE_SHARE * ROBOT.joints.velocity_limit
 HOME = np.array([0.0, 0.0, 1.0])

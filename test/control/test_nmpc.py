@@ -8,10 +8,10 @@ import pytest
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.nmpc import NmpcController, NmpcParameters
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import ALL_HEALTHY
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.allocation import ALL_HEALTHY
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import ParameterError
 
 
 @pytest.fixture(scope='module')

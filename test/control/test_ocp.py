@@ -5,9 +5,9 @@ import numpy as np
 
 from beetle_omni_ros.control.nmpc import NmpcWeights
 from beetle_omni_ros.control.ocp import REFERENCE_SIZE, Rti, stage_functions
-from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
 LAG = 0.03      # [s] of the servos

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State
 from beetle_omni_ros.control.policy import disturbed, observed, PolicyController, PolicyParameters
 from beetle_omni_ros.control.policy_file import PolicyContract
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])

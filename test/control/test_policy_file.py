@@ -16,8 +16,8 @@ from beetle_omni_ros.control.policy_file import (
     robot_hash,
     trained_for,
 )
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 
 ROBOT = RobotParameters.load()
 ACTIONS = ['gimbal1', 'gimbal2', 'gimbal3', 'gimbal4', 'rotor1', 'rotor2', 'rotor3', 'rotor4']

@@ -11,10 +11,10 @@ from beetle_omni_ros.control.references import (
     TILT,
     TILT_LEAD,
 )
-from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.tasks import make_task
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
 TIMES = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4])

@@ -9,8 +9,8 @@ import pytest
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import flatten, ParameterError
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import flatten, ParameterError
 
 ROBOT = RobotParameters.load()
 ROOT = Path(__file__).resolve().parents[2]
@@ -18,7 +18,7 @@ MODULE = '''
 from dataclasses import dataclass
 import numpy as np
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.model.schema import parameter
 
 
 class MyController:

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.turns import level_between, route, ROUTED
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.parameters import RobotParameters
 
 AXES = RobotParameters.load().tilt_axes
 STEPS = np.linspace(-0.5, 0.5, 101)[:, None]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
-from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.model.parameters import JOINT_NAMES, RobotParameters
+from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 ROBOT = RobotParameters.load()

@@ -8,13 +8,13 @@ from rosbags.interfaces import Nodetype
 from synthetic_flights import fly
 import yaml
 
-from beetle_omni_ros.messages.bag_types import from_bytes, TYPESTORE
-from beetle_omni_ros.messages.topics import ALL
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.urdf import description
-from beetle_omni_ros.runs.bag import read_messages
-from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.tasks import make_task
+from beetle_omni_ros.bags.bag import read_messages
+from beetle_omni_ros.bags.bag_types import from_bytes, TYPESTORE
+from beetle_omni_ros.bags.bag_writer import BagWriter
+from beetle_omni_ros.bags.topics import ALL
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.urdf import description
 
 VIEWERS = share_path('viewers')
 SHOWN = {'robot_description': 'std_msgs/msg/String'}       # beside the topics of a flight

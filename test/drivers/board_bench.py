@@ -9,7 +9,7 @@ import numpy as np
 
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.motor_board import MotorBoard
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 QUICK = {'boot_time': 0.05, 'idle_timeout': 1.0, 'throttle_low_time': 0.3,

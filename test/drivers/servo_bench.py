@@ -9,7 +9,7 @@ import numpy as np
 
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.drivers.servo_bus import ServoBus
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
 JOINTS = RobotParameters.load().joints

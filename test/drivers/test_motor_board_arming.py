@@ -9,7 +9,7 @@ pytest.importorskip('serial')
 
 from beetle_omni_ros.drivers.motor_board import Arming, PATIENCE, STEP
 from beetle_omni_ros.drivers.motor_board_state import BoardStatus
-from beetle_omni_ros.robot.mode import Mode
+from beetle_omni_ros.model.mode import Mode
 
 CYCLE = 0.005
 DISARMED = BoardStatus('disarmed', 'none', (), 1)

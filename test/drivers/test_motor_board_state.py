@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies
 import pytest
 import reference_packets as reference
 
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 pytest.importorskip('pymavlink')
 

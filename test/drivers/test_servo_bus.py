@@ -11,8 +11,8 @@ from servo_bench import arrived, bench, COUNT, JOINTS, read, running, until
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.drivers.servo_link import ServoBusError
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import bind, load_yaml, ParameterError
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import bind, load_yaml, ParameterError
 from beetle_omni_ros.sim.emulated import servo_bus as table
 
 GOAL = np.array([0.4, -1.2, 3.7, -3.9])

@@ -19,7 +19,7 @@ from dataclasses import replace
 import sys, time
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 shipped = ServoBusParameters.load()
 bus = ServoBus(replace(shipped, port=sys.argv[1], reply_time=0.05),
                RobotParameters.load().joints)

@@ -8,7 +8,7 @@ import pytest
 
 from beetle_omni_ros.estimation import ekf as ekf_module
 from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, JUMP_POSES
-from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.model import rotations
 
 
 def new_ekf():

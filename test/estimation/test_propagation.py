@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.estimation.state import Node, propagate, STATES, transition
-from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.model import rotations
 
 
 def moved(node, error):

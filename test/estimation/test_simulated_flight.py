@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.hover import HoverController, HoverParameters
 from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
 DURATION, HEIGHT, POSE_TIME = 8.0, 2.0, 2.0

@@ -7,8 +7,8 @@ import pytest
 
 from beetle_omni_ros.estimation import model
 from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.readings import ImuReading, PoseReading
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.readings import ImuReading, PoseReading
 
 TICK, HOVER, TURN, END = 0.005, 8.0, 2.0, 12.0      # [s]
 

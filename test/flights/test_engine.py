@@ -15,9 +15,9 @@ from beetle_omni_ros.identify.flights.spectrum import EDGES, spectrum
 from beetle_omni_ros.identify.flights.table import Format, read_flight
 from beetle_omni_ros.identify.flights.table_verdict import load_tables
 from beetle_omni_ros.identify.gap.command import gap_results
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import ParameterError
 
 REAL = Path(__file__).parents[1] / 'data/nanobench'
 BESIDE = Path(__file__).parents[3] / 'shared/data/flights'

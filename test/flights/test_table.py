@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.flights.table import Format, read_flight
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model.schema import ParameterError
 
 FORMAT = """
 time: {columns: [ms], unit: ms}

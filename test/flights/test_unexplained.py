@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.flights.spectrum import spectrum
 from beetle_omni_ros.identify.flights.unexplained import line, repeatable
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
 CHANNELS = 'force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torque_z'

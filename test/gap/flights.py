@@ -10,7 +10,7 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = replace(RobotParameters.load(), multibody=None)
 P = GapParameters.load()

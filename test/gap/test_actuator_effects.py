@@ -16,8 +16,8 @@ from beetle_omni_ros.identify.gap.servo import (
     Windows,
 )
 from beetle_omni_ros.identify.gap.signals import Signals
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
 
 MOTION = Motion(9, 12.0)
 FINE = 2e-4

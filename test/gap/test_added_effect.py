@@ -18,8 +18,8 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.command import gap_results
 from beetle_omni_ros.identify.gap.ingest import prepare
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
-from beetle_omni_ros.robot import catalogue
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.model import catalogue
+from beetle_omni_ros.model.effects import CATALOGUE
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs/how-to/add_an_effect.md'
 ENTRY, MEASURED, TEST = re.findall(r'```python\n(.*?)```', PAGE.read_text(), flags=re.S)

@@ -11,9 +11,9 @@ import pytest
 from beetle_omni_ros.identify.flights.priors import entries_of, Entry
 from beetle_omni_ros.identify.flights.results import FORM_DEVIATION, parameters
 from beetle_omni_ros.identify.gap.apply import write_corrected
-from beetle_omni_ros.robot.catalogue import ignored
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.catalogue import ignored
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
 FOUND = {'mass.mass': 0.004, 'inertia.inertia[0]': 0.02, 'inertia.inertia[1]': -0.01,

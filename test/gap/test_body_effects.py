@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE
 
 MOTION = Motion()
 HOVER = ROBOT.mass * ROBOT.gravity / 4

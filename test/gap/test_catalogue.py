@@ -1,6 +1,6 @@
 """Every name that programs rely on is in the catalogue, with a complete description."""
 
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE
 
 # layer -> names of its effects, with those of their parameters that are fixed
 NAMES = {

@@ -16,11 +16,11 @@ from rich.console import Console
 
 import beetle_omni_ros
 from beetle_omni_ros import cli
+from beetle_omni_ros.bags.bag import read_messages
+from beetle_omni_ros.bags.bag_writer import BagWriter
 from beetle_omni_ros.identify.gap.command import gap_results, run_gap
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import read_messages
-from beetle_omni_ros.runs.bag_writer import BagWriter
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 
 EXAMPLE = Path(__file__).parents[2] / 'examples' / 'gap_two_bags.py'
 TRUE = np.array(WIND)

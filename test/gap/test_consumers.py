@@ -13,10 +13,10 @@ from beetle_omni_ros.control.nmpc import NmpcParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.identify.gap.keys import number_of
-from beetle_omni_ros.robot import catalogue, dynamics
-from beetle_omni_ros.robot.allocation import Allocator
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model import catalogue, dynamics
+from beetle_omni_ros.model.allocation import Allocator
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.sim.parameters import draw, SimulatorParameters
 from beetle_omni_ros.sim.simulator import CommandLink, Simulator
 

@@ -20,8 +20,8 @@ from beetle_omni_ros.identify.recording.check import checked
 from beetle_omni_ros.identify.recording.damage import changed
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.identify.recording.readings import sensor_damages
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.resources import share_path
 
 ROBOT = RobotParameters.load()
 

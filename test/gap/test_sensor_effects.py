@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, names_of
-from beetle_omni_ros.robot.catalogue import ignored
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.model.catalogue import ignored
+from beetle_omni_ros.model.effects import CATALOGUE
 
 MOTION = Motion(5)
 NEUTRAL = dict(model(MOTION.flight()).residual({}).items())

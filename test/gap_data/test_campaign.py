@@ -91,7 +91,7 @@ def imported(path):
 @pytest.mark.parametrize('path', sorted(ROOT.rglob('*.py')), ids=lambda path: path.stem)
 def test_only_messages_and_writer_of_bags_are_those_of_the_package(path):
     names = {name for name in imported(path) if name.split('.')[0] == 'beetle_omni_ros'}
-    shared = 'control.base', 'robot.readings', 'runs.bag_writer'
+    shared = 'control.base', 'model.readings', 'bags.bag_writer'
     assert names == ({f'beetle_omni_ros.{name}' for name in shared} if path.stem == 'bags'
                      else set())
 

@@ -4,7 +4,7 @@ import csv
 
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 ROWS = RobotParameters.load().rotors.map
 RATIO = 0.0165

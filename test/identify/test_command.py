@@ -9,7 +9,7 @@ from rotor_logs import write as write_bench
 from servo_logs import log_of, sweep, write
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 SERVOS = [{'coulomb': 0.012}, {'coulomb': 0.02}]
 

@@ -9,7 +9,7 @@ from servo_logs import COUNT, log_of, sweep, trapezoid
 
 from beetle_omni_ros.identify.servo.joint import identify, interval, joint_results, left_out_rms
 from beetle_omni_ros.identify.servo.model import INDEX
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
 PARTS = {'slow': {'duration': 6.0},

@@ -15,8 +15,8 @@ from beetle_omni_ros.identify.servo.joint import identify, joint_results, Line
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.identify.servo.robot import file_sets, own_delay
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.servo import play
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.servo import play
 
 REAL = sorted((Path(__file__).resolve().parents[3] / 'shared' / 'data').glob('joint_*.csv'))
 SHIPPED = RobotParameters.load()

@@ -5,9 +5,9 @@ import pytest
 from servo_logs import COUNT, sweep
 from synthetic_flights import write_command, write_joints
 
+from beetle_omni_ros.bags.bag_writer import BagWriter
 from beetle_omni_ros.identify.servo.log import fresh_rows, JointLog, read_joint_log
-from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.files import LogError
+from beetle_omni_ros.model.files import LogError
 
 HEADER = ['t_s', 'q1_rad', 'q2_rad', 'command_rad']
 

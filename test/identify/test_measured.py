@@ -12,8 +12,8 @@ import yaml
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.identify.servo.robot import own_delay
-from beetle_omni_ros.robot.parameters import RobotParameters, value_of
-from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.model.parameters import RobotParameters, value_of
+from beetle_omni_ros.model.resources import share_path
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLISHED, MEASURED = RobotParameters.load(), RobotParameters.load('measured')

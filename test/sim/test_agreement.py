@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from sim_robots import acceleration, massless_modules, plant, ROBOT
 
-from beetle_omni_ros.robot import dynamics
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.rotations import normalized
+from beetle_omni_ros.model import dynamics
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.rotations import normalized
 from beetle_omni_ros.sim.forces import ServoLoads
 
 EFFECTS = {

@@ -8,8 +8,8 @@ import pytest
 from sim_robots import HIGH, ROBOT, WORLD
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim import sensors
 from beetle_omni_ros.sim import simulator as whole
 from beetle_omni_ros.sim.fault_lists import load_cases, load_faults, parse_faults

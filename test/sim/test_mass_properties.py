@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sim_robots import plant, ROBOT
 
-from beetle_omni_ros.robot.parameters import combined, mass_properties, Variation
+from beetle_omni_ros.model.parameters import combined, mass_properties, Variation
 
 
 def whole(properties):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sim_robots import HIGH, momenta, plant, ROBOT, WORLD
 
-from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.model import rotations
 from beetle_omni_ros.sim.mjcf import PAYLOAD_DEPTH
 
 WEIGHTLESS = replace(ROBOT, gravity=0.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sim_robots import plant, ROBOT, WORLD
 
-from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
+from beetle_omni_ros.model.servo import NUMPY, Servo, Step
 
 KP, TICK = ROBOT.joints.kp, WORLD.tick
 

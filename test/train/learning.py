@@ -8,7 +8,7 @@ pytest.importorskip('onnxscript')
 
 import torch
 
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 from beetle_omni_ros.train.parameters import read_parameters
 

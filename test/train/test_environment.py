@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import torch
 
 from beetle_omni_ros.control.disturbance import DisturbanceParameters
-from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Battery
 from beetle_omni_ros.train import rewards

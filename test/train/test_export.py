@@ -12,7 +12,7 @@ import torch
 
 import beetle_omni_ros
 from beetle_omni_ros.control.policy_file import PolicyContract, PolicyNetwork, verify
-from beetle_omni_ros.robot.schema import RunError
+from beetle_omni_ros.model.schema import RunError
 from beetle_omni_ros.train import network as module
 from beetle_omni_ros.train.network import export_policy, ExportedPolicy
 from beetle_omni_ros.train.runner import Runner

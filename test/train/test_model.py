@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from sim_robots import plant, WORLD
 
 from beetle_omni_ros.control.policy_file import robot_hash, TRAINED_FOR
-from beetle_omni_ros.robot import dynamics
-from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.model import dynamics
+from beetle_omni_ros.model.allocation import Allocator
 from beetle_omni_ros.train import model
 
 PERIOD, SUBSTEPS = 0.01, 4

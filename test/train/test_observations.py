@@ -9,7 +9,7 @@ import torch
 from beetle_omni_ros.control.base import PoseTarget, Reference, State
 from beetle_omni_ros.control.guidance import Trimming
 from beetle_omni_ros.control.policy import disturbed, observed
-from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.train import batch
 from beetle_omni_ros.train.batch import delayed, extrapolated, sensed
 

@@ -5,7 +5,7 @@ import pytest
 from rsl_rl.algorithms import PPO
 import torch
 
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.train.runner import Runner
 
 

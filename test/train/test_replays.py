@@ -5,7 +5,7 @@ from learning import only, quiet
 import pytest
 import torch
 
-from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.train import batch
 from beetle_omni_ros.train.starts import Replays
 

@@ -8,7 +8,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
 
-from beetle_omni_ros.robot.schema import ParameterError, RunError
+from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.train import rewards
 from beetle_omni_ros.train.runner import Runner
 

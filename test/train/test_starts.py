@@ -6,8 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 import torch
 
-from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.train.batch import Draw
 from beetle_omni_ros.train.model import (
     ACTUATORS,

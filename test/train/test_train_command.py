@@ -12,9 +12,9 @@ import pytest
 from beetle_omni_ros import cli
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import flatten
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import flatten
 from beetle_omni_ros.train import command
 from beetle_omni_ros.train.command import parse_changes
 from beetle_omni_ros.train.parameters import read_parameters, TrainParameters

@@ -12,9 +12,9 @@ import os
 import socket
 import sys
 
-MODULES = ('beetle_omni_ros.cli', 'beetle_omni_ros.evaluation.command',
-           'beetle_omni_ros.faults.command', 'beetle_omni_ros.identify.gap.command',
-           'beetle_omni_ros.view.report')
+MODULES = ('beetle_omni_ros.cli', 'beetle_omni_ros.flight.evaluate',
+           'beetle_omni_ros.flight.faults', 'beetle_omni_ros.identify.gap.command',
+           'beetle_omni_ros.show.report')
 CLIENT = """#!{python} -IS
 import json, os, socket, sys
 with socket.socket(socket.AF_UNIX) as server:

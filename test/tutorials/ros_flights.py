@@ -5,9 +5,9 @@ import shutil
 
 import pytest
 
+from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.model.resources import share_path
 
 FAULTS = 'faults: {after: {strike: [{kind: rotor_weak, rotor: 1, share: 0.5, at: 100}]}, ' \
     'within: {strike: [{kind: mocap_lost, at: 3, duration: 0.3}]}}\n'

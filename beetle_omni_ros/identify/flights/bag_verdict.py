@@ -23,8 +23,8 @@ from beetle_omni_ros.identify.gap.keys import (
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.residual import limit_starts
 from beetle_omni_ros.identify.gap.signals import IMU_LAG
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
 
 LATE = 0.012, 0.024          # [s] latencies at which the tilting modules are decided, too
 COMPARED = {group: {'used': True, 'channels': [c for c in BagFlight.channels

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from beetle_omni_ros.identify.flights.evidence import Posterior
 from beetle_omni_ros.identify.flights.priors import entries_of, keys_of, spread
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 SLOW = {'rotor_thrust_coefficient', 'rotor_hub_moment', 'centre_of_mass'}
 SESSION = 0.035     # of a rotor's thrust between sessions: 0.3 g, normal flights of CrazyPAD

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 WAVES = 6               # random features
 LEAN = 0.3              # [rad] scale of the tilt of the body

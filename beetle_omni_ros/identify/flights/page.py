@@ -11,8 +11,8 @@ import numpy as np
 from beetle_omni_ros.identify.flights.text import evidence, grids, headline, label, whole
 from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.recording.clocks import begin_of
-from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
-from beetle_omni_ros.pages.page import Grid, html, page, section, verdict_head
+from beetle_omni_ros.show.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
+from beetle_omni_ros.show.page import Grid, html, page, section, verdict_head
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 VERDICT_COLOURS = {'no_gap': '#2b7a3d', 'named': '#1f5fa8', 'named_set': '#1f5fa8',

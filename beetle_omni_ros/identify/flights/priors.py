@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.identify.gap.keys import all_keys, Key, names_of
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
 
 # Typical and smallest deviations of the catalogue are those of a robot of this size.
 WEIGHT, ARM = 29.8, 0.2754      # [N], [m] params/robot.yaml

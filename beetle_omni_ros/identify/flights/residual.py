@@ -28,8 +28,8 @@ from beetle_omni_ros.identify.flights.spectrum import blocks_of
 from beetle_omni_ros.identify.flights.table import Table
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.keys import Key, names_of
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 
 COMPARED = ('acceleration', 'rate')
 GROUPS = ('force', 'torque', *COMPARED)

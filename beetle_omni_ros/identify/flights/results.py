@@ -24,8 +24,8 @@ from beetle_omni_ros.identify.flights.text import summary
 from beetle_omni_ros.identify.flights.unexplained import Unexplained, unexplained
 from beetle_omni_ros.identify.gap.keys import Key
 from beetle_omni_ros.identify.gap.residual import UNITS
-from beetle_omni_ros.robot.catalogue import separating_experiment
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.model.catalogue import separating_experiment
+from beetle_omni_ros.model.effects import CATALOGUE
 
 ALPHA = 0.05            # probability of a false alarm that is accepted
 CROWD = 4               # members of a set from which the flights do not decide

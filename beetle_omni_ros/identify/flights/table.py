@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import load_yaml, ParameterError, quoted
-from beetle_omni_ros.runs.files import LogError, read_table
+from beetle_omni_ros.model.files import LogError, read_table
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import load_yaml, ParameterError, quoted
 
 G = 9.80665     # [m/s^2] of a unit 'g', standard gravity
 # Signal -> width, and unit -> factor to SI.

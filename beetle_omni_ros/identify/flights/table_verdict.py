@@ -18,9 +18,9 @@ from beetle_omni_ros.identify.flights.table import Format, read_flight
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, tolerances
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 
 # Entries of each group of channels. Those of the torques also need the forces.
 FORCES = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_drag',

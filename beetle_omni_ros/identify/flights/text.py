@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from beetle_omni_ros.pages.page import ABSENT, Grid
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.show.page import ABSENT, Grid
 
 WORDS = {'no_gap': 'no gap', 'named': 'named', 'named_set': 'one of a set',
          'unknown': 'unknown: none of the known effects', 'not_decidable': 'not decidable',

@@ -10,9 +10,9 @@ import numpy as np
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.gap.keys import names_of, number_of
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 
 MEMBERS = 4     # length of a list with one value for each rotor or joint
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.messages.bag_types import from_bytes, read_all
-from beetle_omni_ros.messages.topics import TOPICS
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
-from beetle_omni_ros.runs.bag import BagError, read_together
+from beetle_omni_ros.bags.bag import BagError, read_together
+from beetle_omni_ros.bags.bag_types import from_bytes, read_all
+from beetle_omni_ros.bags.topics import TOPICS
+from beetle_omni_ros.model.parameters import JOINT_NAMES, ROTOR_NAMES
 
 # Topic -> columns of its table; PARTS: fields of the message that they come from.
 NEEDED = {'imu/data_raw': 6, 'mocap/pose': 7, 'joint_states': 4, 'command': 8}

@@ -6,9 +6,9 @@ import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.identify.gap.keys import Key, MODULES
-from beetle_omni_ros.robot import dynamics, native
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model import dynamics, native
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
 
 WIDTHS = {'velocity': 3, 'quaternion': 4, 'rate': 3, 'tilt': 4, 'thrust': 4, 'tilt_rate': 4,
           'tilt_acceleration': 4, 'thrust_rate': 4, 'position': 3, 'voltage': 1, 'charge': 1,

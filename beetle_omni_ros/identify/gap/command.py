@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
+from beetle_omni_ros.bags.bag import names_of, runs_in
 from beetle_omni_ros.identify.flights.bag_verdict import judged
 from beetle_omni_ros.identify.flights.page import gap_page
 from beetle_omni_ros.identify.flights.results import ALPHA, result_of
@@ -26,11 +27,10 @@ from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.robot_file import check_differs
 from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_log
 from beetle_omni_ros.identify.servo.page import gap_log_page
-from beetle_omni_ros.pages.page import print_grids, Terminal
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import names_of, runs_in
-from beetle_omni_ros.runs.files import write_json, write_text
+from beetle_omni_ros.model.files import write_json, write_text
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.show.page import print_grids, Terminal
 
 BAD_DATA = 3        # exit status
 LEAST_FITTED = 2    # bags; with more, the last one is held out if none is given

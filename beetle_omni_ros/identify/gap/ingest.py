@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
+from beetle_omni_ros.bags.bag import bag_files
 from beetle_omni_ros.identify.gap.bags import NEEDED, read_recording, Recording
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import aligned
@@ -15,9 +16,8 @@ from beetle_omni_ros.identify.recording.check import checked
 from beetle_omni_ros.identify.recording.clocks import begin_of
 from beetle_omni_ros.identify.recording.damage import changed, Damage
 from beetle_omni_ros.identify.recording.flown import flown
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import bag_files
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 
 TABLES = ('.csv', '.gz')     # endings of files that are no bags
 

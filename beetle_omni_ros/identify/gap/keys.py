@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.robot.catalogue import delaying, ignored
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.terms import EffectParameter
+from beetle_omni_ros.model.catalogue import delaying, ignored
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.terms import EffectParameter
 
 MODULES = 'module_reaction'
 # Effects without a slope at their neutral value; they need a start where they act.

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.model import schema
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import parameter
 
 
 def _time(doc, low=1e-4, high=600.0):

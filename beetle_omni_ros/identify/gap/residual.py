@@ -24,8 +24,8 @@ from beetle_omni_ros.identify.gap.servo import (
     Windows,
 )
 from beetle_omni_ros.identify.gap.signals import Signals
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.servo import NUMPY, Servo
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.servo import NUMPY, Servo
 
 CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torque_z'),
             'A': ('acceleration_x', 'acceleration_y', 'acceleration_z'),

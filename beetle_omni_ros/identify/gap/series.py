@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 from scipy.signal import firwin, upfirdn
 
-from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.model import rotations
 
 SHARPNESS = 5.0     # number of taps times edge over sampling rate
 THIN = 2            # decimation of the grid for the body equations

@@ -1,7 +1,7 @@
 """
 Tilt servos simulated from commands, for many windows and parameter sets at once.
 
-The step is that of :mod:`beetle_omni_ros.robot.servo` with static friction, unlike the smooth
+The step is that of :mod:`beetle_omni_ros.model.servo` with static friction, unlike the smooth
 model of the controllers. Each window begins at the measured state. The memory of a servo is far
 shorter than the warm-up, after which samples count.
 """
@@ -12,10 +12,10 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.keys import friction, MODULES
 from beetle_omni_ros.identify.gap.signals import Signals
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
-from beetle_omni_ros.robot.terms import ServoTerms
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.servo import NUMPY, Servo, Step
+from beetle_omni_ros.model.terms import ServoTerms
 
 
 @dataclass(frozen=True)

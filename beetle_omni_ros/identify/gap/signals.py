@@ -23,10 +23,10 @@ from beetle_omni_ros.identify.gap.series import (
     within,
 )
 from beetle_omni_ros.identify.recording.signals import white_noise
-from beetle_omni_ros.robot.catalogue import ignored
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.servo import play
+from beetle_omni_ros.model.catalogue import ignored
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.servo import play
 
 FINE = 0.005            # [s] grid on which measurements are smoothed
 # The IMU's clock is the reference: its delay shifts all other signals. Shifting the IMU itself

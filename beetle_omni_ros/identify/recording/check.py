@@ -12,7 +12,7 @@ from beetle_omni_ros.identify.recording.limits import shipped
 from beetle_omni_ros.identify.recording.readings import reading_damages, sensor_damages
 from beetle_omni_ros.identify.recording.relations import Mistake, mistakes, Relation, RELATIONS
 from beetle_omni_ros.identify.recording.signals import Signals, signals_of
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 MOST_REPAIRS = 6        # successive; a repair can reveal another damage
 

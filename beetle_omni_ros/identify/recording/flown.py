@@ -9,7 +9,7 @@ from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.recording.damage import changed, COMMAND, POSE
 from beetle_omni_ros.identify.recording.limits import shipped
 from beetle_omni_ros.identify.recording.relations import THRUSTS
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 
 def flown(recording: Recording, robot: RobotParameters,

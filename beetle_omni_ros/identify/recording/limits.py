@@ -5,7 +5,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from beetle_omni_ros.robot.schema import parameter, ParameterFile
+from beetle_omni_ros.model.schema import parameter, ParameterFile
 
 limit = partial(parameter, low=0)
 between = partial(parameter, shape=(2,))

@@ -9,7 +9,7 @@ from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.series import aligned, low_pass, matrices
 from beetle_omni_ros.identify.recording.damage import COMMAND, IMU, JOINTS, POSE
 from beetle_omni_ros.identify.recording.limits import shipped
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 GRAVITY = 'gravity'     # [m/s^2] that the accelerometer measures
 THINNED = 4             # points of the fine grid for each point of the coarse one

@@ -7,8 +7,8 @@ import re
 
 import numpy as np
 
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.files import LogError, missing, read_table
+from beetle_omni_ros.model.files import LogError, missing, read_table
+from beetle_omni_ros.model.schema import ParameterError
 
 # Quantity -> columns with the factor to SI units. 2000 us are 100 % of duty. The sign of a torque
 # with the factor 0 becomes that of thrust.

@@ -18,10 +18,10 @@ from beetle_omni_ros.identify.rotor.surface import (
     temperature_drift,
     torque_ratio,
 )
-from beetle_omni_ros.pages.figures import FAINT, INK, legend, panels, STYLE, svg
-from beetle_omni_ros.pages.page import Grid, page, section
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.files import LogError
+from beetle_omni_ros.model.files import LogError
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.show.figures import FAINT, INK, legend, panels, STYLE, svg
+from beetle_omni_ros.show.page import Grid, page, section
 
 LEVELS = (0.25, 0.5, 0.75, 1.0)     # of the largest duty, for which the ratio is listed
 QUANTITIES = {'thrust': 'N', 'torque': 'N_m'}

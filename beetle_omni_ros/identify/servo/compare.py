@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros import __version__
+from beetle_omni_ros.bags.bag import BagError, read_messages
 from beetle_omni_ros.identify.flights.text import summary
 from beetle_omni_ros.identify.inference.hierarchy import WIDTH
 from beetle_omni_ros.identify.servo.fit import (
@@ -23,9 +24,8 @@ from beetle_omni_ros.identify.servo.joint import identify, joint_results
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX, NAMES, with_encoder_errors
 from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
-from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.bag import BagError, read_messages
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
 
 ALPHA = 0.05        # probability of a wrong name, if each entry has the same prior probability
 AS_WELL = 1.3       # ratio of held-out errors of a corrected file and of the log's best model

@@ -26,7 +26,7 @@ from beetle_omni_ros.identify.servo.model import (
     TERMS,
 )
 from beetle_omni_ros.identify.servo.robot import ENTRIES, LIMITS
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE
 
 LOGARITHMIC = np.array([term.logarithmic for term in TERMS.values()])
 # Of the derivatives: over the kinks of friction and of held commands.

@@ -22,7 +22,7 @@ from beetle_omni_ros.identify.servo.fit import (
 from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.identify.servo.model import INDEX, NAMES, TERMS
 from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, held
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
 
 # Gains, delay, friction and a zero, which every servo has, ...
 SERVO = 'joint_bandwidth', 'joint_command_latency', 'joint_friction', 'joint_offset'

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.runs.bag import BagError, read_bag
-from beetle_omni_ros.runs.files import LogError, missing, read_table
+from beetle_omni_ros.bags.bag import BagError, read_bag
+from beetle_omni_ros.model.files import LogError, missing, read_table
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
 JOINTS: tuple[int, ...] = (1, 2, 3, 4)

@@ -4,7 +4,7 @@ Simulation of a tilt servo for many parameter sets at once.
     q'' = limit(wn^2 (q*(t - delay) + offset - q) - 2 zeta wn q') - wn^2 (load(q) + friction(q'))
     reading = play(q) + gain q + sine sin q + cosine cos q
 
-The step is that of :mod:`beetle_omni_ros.robot.servo` for an inertia of 1. A log without torque
+The step is that of :mod:`beetle_omni_ros.model.servo` for an inertia of 1. A log without torque
 determines only ratios to the stiffness Kp, so friction, load and torque limit are angles: the
 position error at which the servo has this torque.
 """
@@ -20,9 +20,9 @@ import numpy as np
 
 from beetle_omni_ros.identify.inference.hierarchy import Spread
 from beetle_omni_ros.identify.servo.log import JointLog
-from beetle_omni_ros.robot.native import built, EXACT, generated
-from beetle_omni_ros.robot.schema import RunError
-from beetle_omni_ros.robot.servo import CASADI, play, Servo, Step
+from beetle_omni_ros.model.native import built, EXACT, generated
+from beetle_omni_ros.model.schema import RunError
+from beetle_omni_ros.model.servo import CASADI, play, Servo, Step
 
 LONGEST_STEP = 0.0025   # [s]; relative error of the frequency (wn step)^2 / 24: 0.3 % at 100 rad/s
 NEVER = 1e3             # value of a limit without effect

@@ -13,9 +13,9 @@ from beetle_omni_ros.identify.servo.fit import Found
 from beetle_omni_ros.identify.servo.log import FITTED, JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.identify.servo.robot import file_sets, held
-from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
-from beetle_omni_ros.pages.page import Grid, page, section
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.show.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
+from beetle_omni_ros.show.page import Grid, page, section
 
 MILLI = 1e3
 

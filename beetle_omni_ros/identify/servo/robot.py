@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.servo.model import INDEX, NAMES, OFF, TERMS
-from beetle_omni_ros.robot.catalogue import delaying
-from beetle_omni_ros.robot.effects import per_joint
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import load_yaml
+from beetle_omni_ros.model.catalogue import delaying
+from beetle_omni_ros.model.effects import per_joint
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import load_yaml
 
 # Entry -> the terms that it changes; of the catalogue, but for the gain and the load.
 ENTRIES = {

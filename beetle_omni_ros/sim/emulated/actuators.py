@@ -8,8 +8,8 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
 from beetle_omni_ros.sim.faults import Drive
 from beetle_omni_ros.sim.sensors import Frame

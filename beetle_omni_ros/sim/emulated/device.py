@@ -14,7 +14,7 @@ import tty
 
 import numpy as np
 
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.model.schema import parameter
 
 CHUNK = 4096    # [B] size of the kernel's buffer
 PERIOD = 0.01   # [s] longest sleep of the thread

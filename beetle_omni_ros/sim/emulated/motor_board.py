@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from beetle_omni_ros.drivers.mavlink import common, EscInfo, EscStatus, MavlinkReceiver
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.thrust_map import duty_of_command, ThrustMap
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.thrust_map import duty_of_command, ThrustMap
 from beetle_omni_ros.sim.emulated.device import BoardFaults, Device
 from beetle_omni_ros.sim.parameters import RPM_AT_1_NEWTON
 

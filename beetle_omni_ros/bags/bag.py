@@ -1,0 +1,286 @@
+"""Reading of rosbag2 folders (metadata.yaml and MCAP) without ROS, also of truncated files."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from itertools import islice
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.exceptions import InvalidMagic
+from mcap.reader import NonSeekingReader
+import numpy as np
+
+from beetle_omni_ros.bags.bag_types import from_bytes, read_all
+from beetle_omni_ros.bags.conversions import from_nanoseconds
+from beetle_omni_ros.bags.log import FlightLog, LogRecorder, META_KEY, motion, SERIES_OF
+from beetle_omni_ros.bags.topics import ALL, controller_of, TELLING, topic_of, TOPICS
+from beetle_omni_ros.control.base import TrajectoryTarget
+from beetle_omni_ros.model.schema import ParameterError, read_yaml
+
+BagError = ParameterError   # its name in identify
+AT_ONCE = 4096      # messages that are read together
+
+
+class Recorded(NamedTuple):
+    """
+    One message of a bag, or several of one topic in the order of the file.
+
+    Attributes:
+        topic: full name; of several messages that without the namespace of the robot.
+        type: ROS type.
+        data: CDR, or list of it.
+        received: time of recording [s], or (N,) times.
+
+    """
+
+    topic: str
+    type: str
+    data: bytes | list[bytes]
+    received: float | np.ndarray
+
+
+def bag_files(path: str | Path) -> list[Path]:
+    """
+    Find the MCAP files of a RUN.
+
+    Args:
+        path: rosbag2 folder, its metadata.yaml or one of its ``.mcap`` files.
+
+    Raises:
+        ParameterError: no such path, or no MCAP file there.
+
+    """
+    path = Path(path)
+    if not path.exists():
+        raise ParameterError(f'{path}: no such bag')
+    if path.name == 'metadata.yaml':
+        path = path.absolute().parent
+    if path.is_file():
+        if path.suffix != '.mcap':
+            raise ParameterError(f'{path}: expected a rosbag2 folder or a .mcap file')
+        return [path]
+    files = sorted(path.glob('*.mcap'), key=_split_number)
+    if not files:
+        other = sorted(p.name for pattern in ('*.db3', '*.mcap.*', '*.bag')
+                       for p in path.glob(pattern))
+        hint = f' (found {other[0]}; convert it with ros2 bag convert)' if other else ''
+        if (inside := runs_in([path])) != [path]:
+            hint = f"; expected one of the runs in it: {', '.join(run.name for run in inside)}"
+        raise ParameterError(f'{path}: no .mcap file in this folder{hint}')
+    return files
+
+
+def runs_in(paths: Iterable[str | Path]) -> list[Path]:
+    """Paths of RUN arguments, with the bags in a folder of bags in its place."""
+    runs: list[Path] = []
+    for path in map(Path, paths):
+        inside = []
+        if path.is_dir() and not any(path.glob('*.mcap')):
+            inside = sorted({file.parent for file in path.glob('*/*.mcap')})
+        runs += inside or [path]
+    return runs
+
+
+def _split_number(file):
+    """Sort key of a split bag: name_2.mcap comes before name_10.mcap."""
+    number = file.stem.rpartition('_')[2]
+    return (int(number) if number.isdigit() else -1, file.name)
+
+
+def names_of(runs: list[Path]) -> list[str]:
+    """Shortest endings of the paths that are all different, numbered if none are."""
+    paths = [run.absolute().parts for run in runs]
+    for depth in range(1, max((len(parts) for parts in paths), default=1) + 1):
+        names = ['/'.join(parts[-depth:]) for parts in paths]
+        if len(set(names)) == len(names):
+            return names
+    return [f'{name} ({k + 1})' for k, name in enumerate(names)] if runs else []
+
+
+def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterator[Recorded]:
+    """
+    Yield the messages of a bag in the order of recording, up to a truncation.
+
+    Args:
+        path: folder or file, see :func:`bag_files`.
+        warnings: list to which a line is added for each truncated or damaged file.
+
+    Raises:
+        ParameterError: no such bag, unreadable, or not MCAP.
+
+    """
+    found, broken = 0, ''
+    for file in bag_files(path):
+        count = 0
+        try:
+            stream = file.open('rb')
+        except OSError as error:
+            raise ParameterError(f'{file}: {error.strerror}') from None
+        with stream:
+            messages = NonSeekingReader(stream, validate_crcs=True).iter_messages(
+                log_time_order=False)
+            try:
+                for schema, channel, message in messages:
+                    count += 1
+                    yield Recorded(channel.topic, schema.name if schema else '', message.data,
+                                   from_nanoseconds(message.log_time))
+            except Exception as error:  # broken bytes raise anything in the library
+                if isinstance(error, InvalidMagic) and not count:
+                    raise ParameterError(f'{file}: not an MCAP file') from None
+                kind = f'damaged ({type(error).__name__}: {error})' if stream.read(1) \
+                    else 'cut off'
+                broken = f'{file.name}: {kind} after {count} readable messages'
+                if warnings is not None:
+                    warnings.append(broken)
+        found += count
+    if broken and not found:
+        raise ParameterError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
+
+
+def read_together(path: str | Path, warnings: list[str] | None = None
+                  ) -> Iterator[list[Recorded]]:
+    """
+    Yield the messages of a bag of one robot by topic, a few seconds at a time.
+
+    Arguments and errors are as in :func:`read_messages`, and a ParameterError reports several
+    robots. Topics are in the order of their first message.
+    """
+    messages = read_messages(path, warnings)
+    spaces: set[str] = set()    # namespaces of robots
+    while part := list(islice(messages, AT_ONCE)):
+        groups: dict[tuple[str, str], tuple[list, list]] = {}
+        for topic, kind, data, received in part:
+            all_data, times = groups.setdefault((f"/{topic.lstrip('/')}", kind), ([], []))
+            all_data.append(data)
+            times.append(received)
+        spaces |= {topic.removesuffix(name).rstrip('/') for topic, _ in groups for name in TELLING
+                   if topic.endswith(f'/{name}')}
+        if len(spaces) > 1:
+            found = ' and '.join(f"'{space}'" for space in sorted(spaces))
+            raise ParameterError(f'{path}: holds several robots ({found}); expected one')
+        begin = f"{next(iter(spaces), '')}/"
+        yield [Recorded('diagnostics' if topic == '/diagnostics' else topic.removeprefix(begin),
+                        kind, data, np.array(times))
+               for (topic, kind), (data, times) in groups.items()]
+
+
+def read_bag(path: str | Path) -> FlightLog:
+    """
+    Read a flight.
+
+    Args:
+        path: rosbag2 folder, or one of its files.
+
+    Returns:
+        The flight; its ``warnings`` list missing and unusable data.
+
+    Raises:
+        ParameterError: no such bag, unreadable, not MCAP, or several robots in it.
+
+    """
+    reading, warnings = _Reading(), []
+    for together in read_together(path, warnings):
+        for messages in together:
+            reading.take(messages)
+    reading.recorder.write_meta(_metadata(path, warnings))
+    log = reading.recorder.log()
+    log.warnings, log.source = warnings + reading.problems(), str(path)
+    return log
+
+
+def read_flights(paths: Iterable[str | Path], most: int) -> dict[str, FlightLog]:
+    """
+    Read the flights of RUN arguments: name -> flight with poses.
+
+    Raises:
+        ParameterError: as of :func:`read_bag`, a bag without a pose, or more than ``most`` runs.
+
+    """
+    runs = runs_in(paths)
+    if len(runs) > most:
+        raise ParameterError(f'{len(runs)} runs; expected at most {most}')
+    logs = {}
+    for path, name in zip(runs, names_of(runs), strict=True):
+        log = logs[name] = read_bag(path)
+        if not len(motion(log).t):
+            raise ParameterError('; '.join([f'{path}: no pose of the robot; expected '
+                                            'ground_truth/odom or odom', *log.warnings]))
+    return logs
+
+
+class _Reading:
+    """Sorts messages by topic into a log, and counts unusable ones."""
+
+    def __init__(self):
+        self.recorder = LogRecorder()
+        self._counts: Counter = Counter()
+        self._bad: Counter = Counter()
+        self._reason: dict[str, str] = {}
+
+    def take(self, messages: Recorded) -> None:
+        """Read messages of one topic; those of a series together."""
+        name = messages.topic
+        if name not in ALL and not controller_of(name):
+            return
+        topic = topic_of(name)
+        if messages.type != topic.type:
+            self._refuse(name, f'type is {messages.type}, not {topic.type}', len(messages.data))
+        elif name in SERIES_OF or controller_of(name):
+            rows, value, refused = read_all(topic, messages.data)
+            if len(rows):
+                received = messages.received[rows]
+                stamp = np.where(value.stamp == 0, received, value.stamp)
+                self.recorder.write(name, replace(value, stamp=stamp), received)
+            self._counts[name] += len(rows)
+            for reason, number in refused.items():
+                self._refuse(name, reason, number)
+        else:
+            for data, received in zip(messages.data, messages.received.tolist(), strict=True):
+                try:
+                    value = topic.read(from_bytes(data, topic.type))
+                    self.recorder.write(name, _stamped(value, received), received)
+                    self._counts[name] += 1
+                except Exception as error:  # must not prevent reading the others
+                    self._refuse(name, str(error) or type(error).__name__)
+
+    def _refuse(self, name, reason, count=1):
+        self._bad[name] += count
+        self._reason.setdefault(name, reason)
+
+    def problems(self) -> list[str]:
+        """Return a line about missing topics, and one for each topic with unusable messages."""
+        missing = [name for name, topic in TOPICS.items()
+                   if topic.required and not self._counts[name]]
+        if 'target_pose' in missing and self._counts['target_trajectory']:
+            missing.remove('target_pose')
+        lines = [f"no message on {', '.join(missing)}"] if missing else []
+        return lines + [f'{name}: {count} messages not used ({self._reason[name]})'
+                        for name, count in self._bad.items()]
+
+
+def _stamped(value, received):
+    """The value; without a stamp (`ros2 topic pub`), it gets the time of receipt."""
+    if isinstance(value, list):
+        return [entry if entry.t else replace(entry, t=received) for entry in value]
+    if getattr(value, 'stamp', True):   # a text has none, neither has the health of the actuators
+        return value
+    if isinstance(value, TrajectoryTarget):
+        return replace(value, stamp=received, times=value.times + received)
+    return replace(value, stamp=received)
+
+
+def _metadata(path, warnings):
+    """Metadata of a finished bag; empty if there is none."""
+    path = Path(path)
+    file = (path if path.is_dir() else path.absolute().parent) / 'metadata.yaml'
+    if not file.is_file():
+        warnings.append('metadata.yaml is missing: the recorder did not finish')
+        return {}
+    try:
+        custom = read_yaml(file)['rosbag2_bagfile_information']['custom_data']
+        return dict(json.loads((custom or {}).get(META_KEY, '{}')))
+    except (KeyError, TypeError, AttributeError, ValueError, RecursionError):
+        warnings.append('metadata.yaml is not readable')
+        return {}

@@ -1,1 +1,0 @@
-"""Bring-up checks of the real robot. They move nothing and change no setting."""

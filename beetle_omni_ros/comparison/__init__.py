@@ -1,1 +1,0 @@
-"""Comparison of controllers in every published experiment: a sweep of flights and one page."""

@@ -1,1 +1,0 @@
-"""The flight stack in one process without ROS, faster than real time."""

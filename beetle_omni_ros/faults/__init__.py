@@ -1,1 +1,0 @@
-"""Flights with faults: their outcomes, compared with the expected ones, and one page."""

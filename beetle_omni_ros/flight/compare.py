@@ -1,0 +1,158 @@
+"""`beetle_omni compare`: flies every experiment with several controllers and writes the page."""
+
+from collections.abc import Sequence
+from pathlib import Path
+import platform
+import shlex
+import sys
+
+from rich.console import Console
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import guidance_of
+from beetle_omni_ros.control.registry import ControllerOptions
+from beetle_omni_ros.flight import comparison_page as page
+from beetle_omni_ros.flight.campaign import file_digest, policy_file, Store, sweep, versions
+from beetle_omni_ros.flight.compared_flights import CONDITIONS, fly_flight, plan, TASKS
+from beetle_omni_ros.flight.summary import summarise
+from beetle_omni_ros.model.files import write_json, write_text
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.resources import commit
+from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.show.page import print_grids, rendered, Terminal
+
+PAGE, NUMBERS, TEXT = 'comparison.html', 'comparison.json', 'README.md'
+FLIGHTS = '.flights'  # default folder of finished flights, in the output folder
+
+
+def run_compare(*, output: Path, controllers: list[str] | None = None,
+                tasks: list[str] | None = None, conditions: list[str] | None = None,
+                seeds: list[int] | None = None, jobs: int | None = None,
+                backend: str = 'processes', address: str | None = None,
+                cache: Path | None = None, policy: Path | None = None,
+                plant: Path | None = None, json_path: Path | None = None,
+                console: Console | None = None) -> dict:
+    """
+    Fly the missing flights, then write page, pictures and numbers.
+
+    Arguments are the options of `beetle_omni compare`; None is their default.
+
+    Returns:
+        content of ``comparison.json``.
+
+    Raises:
+        ParameterError: unusable input.
+        RunError: a worker was lost.
+
+    """
+    console = console or Terminal()
+    RobotParameters.load(plant)     # refuses an unusable file before any work
+    available, skipped = _available(controllers or registry.COMPARED, policy,
+                                    refuse=controllers is not None)
+    for name, reason in skipped.items():
+        print(f'beetle_omni: {name} is left out: {reason}', file=sys.stderr)
+    flights = plan([entry.reference for entry in available], tasks or TASKS,
+                   conditions or CONDITIONS, seeds, policy, plant)
+    output = Path(output)
+    store = Store(cache or output / FLIGHTS)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        made = sweep(fly_flight, [(flight, flight.make_task()) for flight in flights],
+                     store=store, backend=backend, jobs=jobs, address=address, console=console,
+                     line=lambda flight, result, kept: f'{flight.name}: ' + (
+                         result['failure'] or ('kept' if kept else f"{result['cpu_s']:.0f} s")))
+    except KeyboardInterrupt:
+        print(f'beetle_omni: finished flights are kept in {store.folder}; the same command '
+              'continues from there', file=sys.stderr)
+        raise
+    except OSError as error:
+        raise ParameterError(f'{output}: cannot write there ({error.strerror})') from None
+    flown = dict(zip(flights, made, strict=True))
+    results = results_of(flown, tasks or TASKS, conditions or CONDITIONS,
+                         {entry.name: text for entry, text in available.items()}, skipped)
+    write(results, flown, output, console)
+    write_json(json_path, results)
+    return results
+
+
+def _available(names, policy, refuse):
+    """
+    Build each controller once, which also fills the cache of compiled code for the workers.
+
+    Returns the entries that can fly with the text of their guidance, and the reason for each
+    other one. With ``refuse`` the first reason is raised instead.
+    """
+    robot, available, skipped = RobotParameters.load(), {}, {}
+    learnt = registry.OWNER['--policy']
+    for entry in registry.find_all(names):
+        try:
+            available[entry] = guidance_of(entry.make(robot, ControllerOptions(
+                policy=policy if entry.name == learnt else None)))
+        except (ParameterError, FileNotFoundError) as error:
+            if refuse:
+                raise ParameterError(str(error)) from None
+            skipped[entry.name] = ' '.join(str(error).split())
+    if policy and learnt not in {entry.name for entry in available}:
+        raise ParameterError(f"--policy {policy}: for the controller '{learnt}', which does not "
+                             'fly')
+    return available, skipped
+
+
+def results_of(flown: dict, tasks: Sequence[str], conditions: Sequence[str],
+               guidance: dict[str, str], skipped: dict) -> dict:
+    """
+    Content of the JSON file, from plain values, so that it is equal after reading.
+
+    ``guidance`` is that of each controller, ``skipped`` the reason for each other one.
+    """
+    order = {name: k for k, name in enumerate((*tasks, *conditions, *guidance))}
+    flights = sorted(flown, key=lambda flight: (
+        order[flight.task], order[flight.conditions], order[flight.controller], flight.seed))
+    files = {flight.controller: policy_file(flight.reference, flight.policy)
+             for flight in flights}
+    return {
+        'meta': {'version': __version__, 'commit': commit(),
+                 'command': shlex.join(['beetle_omni', *sys.argv[1:]]),
+                 'controllers': list(guidance), 'guidance': guidance, 'skipped': skipped,
+                 'specs': {flight.controller: flight.spec for flight in flights if flight.spec},
+                 'tasks': list(tasks), 'conditions': list(conditions),
+                 'seeds': sorted({flight.seed for flight in flights}),
+                 'plant': flights[0].plant,
+                 'policies': {name: f'{file.name} ({file_digest(file)})'
+                              for name, file in files.items() if file},
+                 'cpu_s': sum(result.get('cpu_s', 0.0) for result in flown.values()),
+                 'processor': _processor(), 'versions': versions()},
+        'summary': summarise({flight: flown[flight] for flight in flights}),
+        'flights': [{'task': flight.task, 'conditions': flight.conditions,
+                     'controller': flight.controller, 'seed': flight.seed,
+                     **{key: flown[flight].get(key) for key in (
+                         'failure', 'cpu_s', 'host', 'metrics')}} for flight in flights]}
+
+
+def _processor():
+    try:
+        lines = Path('/proc/cpuinfo').read_text().splitlines()
+        return next(line.partition(':')[2].strip() for line in lines if 'model name' in line)
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def write(results: dict, flown: dict, output: Path, console: Console) -> None:
+    """Write page, pictures, text and numbers, and print the table of all experiments."""
+    controllers = results['meta']['controllers']
+    sections = page.sections(results, {flight: flown[flight] for flight in sorted(
+        flown, key=lambda flight: (controllers.index(flight.controller), flight))})
+    for block in (block for section in sections for block in section.blocks):
+        if isinstance(block, page.Picture):
+            (output / f'{block.name}.png').write_bytes(block.data)
+    content = page.content(results, sections)
+    for name in (PAGE, TEXT):
+        write_text(output / name, rendered(f'comparison{Path(name).suffix}', **content), 'page')
+    write_json(output / NUMBERS, results)
+    print_grids([page.glance(results)], console)
+    broken = sum(bool(result['failure']) for result in flown.values())
+    if broken:
+        console.print(f'{broken} of {len(flown)} flights failed, see above and on the page',
+                      style='red', highlight=False)
+    console.print(f'{output / PAGE}', highlight=False)

@@ -1,0 +1,243 @@
+"""The comparison as one self-contained HTML page, and as Markdown with pictures."""
+
+from base64 import b64encode
+from dataclasses import dataclass
+from io import BytesIO
+
+import matplotlib
+from matplotlib.figure import Figure
+import numpy as np
+from PIL import Image
+
+from beetle_omni_ros.control.tasks import RISING
+from beetle_omni_ros.flight import comparison_plots as plots
+from beetle_omni_ros.flight.summary import (
+    CONDITIONS,
+    kind_of,
+    look,
+    METRICS,
+    PRINTED,
+    printed,
+    PUBLISHED,
+    task_title,
+)
+from beetle_omni_ros.show import figures
+from beetle_omni_ros.show.page import ABSENT, Grid, number
+
+DOTS = 180  # per inch
+COLOURS = 128  # of a picture; enough for thin lines with smooth edges
+TITLE = 'RL and NMPC under one architecture'
+COMPUTED = ('"0.3 on average"', '"typically within 10"')    # published times of a step
+TEXTS = {
+    'random': 'One pose after the other, 8 s each, x and y within 2 m, z from 0.6 to 2 m, any '
+              'attitude, upside down included.',
+    'waypoints': 'The five poses of the real-world experiment, 8 s each, three rounds.',
+    'lemniscate': 'Position, roll, pitch and yaw follow a figure of eight in space, five rounds; '
+                  'the policies were trained for poses, not for trajectories.',
+    'force': 'A vertical force that rises until control is lost.',
+    'torque': 'Torque impulses that rise until control is lost.',
+    'wind': 'A fan blows along x at 2, 3 and 4 m/s, with the turbulence of a jet.',
+    'pushes': 'A stick pushes from four sides, 10 N for 0.1 s.',
+    'payload': 'Masses attached while hovering, unknown to estimator and controllers.',
+    'hover': 'How still the robot stands, and how smooth its commands are.'}
+POSES = 'U: mean over 7.0 to 7.5 s of the 8 s of a pose; L: over 1.0 to 7.0 s. A crash ends a ' \
+        'flight; the later poses are not reached, and have no errors. Reached: U below 0.10 m ' \
+        'and 10 deg.'
+LEVELS = '{} along {} for {:g} s at each level, then {:g} s of rest, while hovering at ' \
+         '[0, 0, 1.5] m with 25 deg of roll. Lost: more than 1.5 m away, on the ground, or ' \
+         'turned by more than 90 deg when the next level is due. That ends the flight. Never ' \
+         'lost counts as one level more.'
+NOTES = {
+    'intervals': 'Cells: mean [95 % interval]; "of n" where fewer than the others flew to the '
+                 'end. Second lines: difference to the best mean, paired by seed{}. Bold: every '
+                 'difference to it excludes zero.',
+    'poses': POSES,
+    'random': f'{POSES} The published poses are drawn from the same ranges, not the same; whether '
+              'their |q* − q| counts the whole flight or the hover is not stated.',
+    'waypoints': f'{POSES} Ours is simulated, the published columns are measured on the real '
+                 'robot: not the same experiment. A value is the mean of a flight.',
+    'lemniscate_large': 'As the lemniscate, with 2.5 rad of roll and pitch.',
+    'lemniscate': 'Ours is simulated, the published columns are measured on the real robot. The '
+                  "curve is that of the authors' code. A value is the mean of a flight.",
+    **{name: LEVELS.format(kind, ('x', 'y', 'z')[int(np.flatnonzero(direction)[0]) % 3], *times)
+       for name, (kind, direction, _, *times) in RISING.items()},
+    'wind': 'Errors from 2 s to 10 s at 4 m/s. The published columns are of the real robot.',
+    'pushes': 'Means over four pushes; not recovered counts as 5 s. The published columns are of '
+              'the real robot.',
+    'payload': 'Magnitudes of the mean over 7.0 to 7.5 s after the mass was attached. The '
+               'publication shows its real robot in a figure without numbers, with 1.0 kg for RL '
+               'only.',
+    'hover': 'At [0, 0, 1] m. Errors from 8 s to the end of 60 s; command changes from 7.0 to '
+             '7.5 s.',
+    'glance': 'Published numbers are of Gazebo, or of the real robot where marked with *; ours '
+              'are simulated. Bold as in the tables below, which have the intervals. CPU times: '
+              "everything for one command on one core, median of the flights' medians; the "
+              "published ones are of the robot's ARM board, that of RL of the inference alone."}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A drawing as PNG, with its file name and caption."""
+
+    name: str
+    caption: str
+    data: bytes
+
+    @property
+    def source(self) -> str:
+        """The data as a source of an <img>."""
+        return f'data:image/png;base64,{b64encode(self.data).decode()}'
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading, a paragraph, and pictures and tables in their order."""
+
+    title: str
+    text: str
+    blocks: list[Grid | Picture]
+
+
+def interval(entry: dict, digits: int) -> str:
+    """Text of a mean and its interval."""
+    text = number(entry['mean'], digits)
+    return text if entry['low'] is None else \
+        f"{text} [{number(entry['low'], digits)}, {number(entry['high'], digits)}]"
+
+
+def table(results: dict, task: str, conditions: str) -> Grid:
+    """Every metric of a task: mean with interval, differences to the best, and the range."""
+    numbers = results['summary']['tasks'][task][conditions]
+    ours = [name for name in results['meta']['controllers'] if name in numbers['flights']]
+    kind = kind_of(task)
+    paper = list(PUBLISHED) if kind in PRINTED else []
+    rows: list[list[str]] = []
+    best: set[tuple[int, int]] = set()
+    for key, metric in METRICS[kind].items():
+        of, given = numbers['metrics'][key], [printed(task, metric, name) for name in paper]
+        most = max(of[name]['count'] for name in ours)
+        best |= {(len(rows), column) for column, name in enumerate(ours, 1) if of[name]['best']}
+        rows.append([metric.title, *(
+            interval(of[name], metric.digits)
+            + f" of {of[name]['count']}" * (0 < of[name]['count'] < most) for name in ours),
+            *(number(entry.get('mean'), None)
+              + (f" ± {number(entry['std'], None)}" if entry.get('std') else '')
+              for entry in given)])
+        if len(ours) > 1:
+            rows.append(['difference to the best', *(
+                ABSENT if of[name]['difference'] is None
+                else interval(of[name]['difference'], metric.digits) for name in ours),
+                *(ABSENT for _ in paper)])
+        if kind in ('random', 'poses') and most > len(numbers['flights'][ours[0]]['seeds']) \
+                and not metric.more:
+            rows.append(['least to largest', *(
+                f"{number(entry.get('min'), digits)} to {number(entry.get('max'), digits)}"
+                if entry.get('min') is not None else ABSENT for entry, digits in (
+                    *((of[name], metric.digits) for name in ours),
+                    *((entry, None) for entry in given)))])
+    if kind not in RISING:
+        rows.append(['flights that crashed', *(
+            '{} of {}'.format(numbers['flights'][name]['lost'],
+                              len(numbers['flights'][name]['seeds'])) for name in ours),
+            *(ABSENT for _ in paper)])
+    seeds = sorted({seed for name in ours for seed in numbers['flights'][name]['seeds']})
+    real = 'real robot' if PRINTED.get(kind, (0, False))[1] else 'Gazebo'
+    return Grid(
+        f'{task_title(task)}, {conditions} conditions',
+        ['', *(look(name).label for name in ours),
+         *(f'{look(name).label} (published, {real})' for name in paper)],
+        rows, best=frozenset(best), faint_columns=frozenset(range(len(ours) + 1, len(rows[0]))),
+        note=' '.join([f"Seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}.",
+                       NOTES['intervals'].format(' and pose' * (kind in ('random', 'poses'))),
+                       NOTES[kind]]))
+
+
+def glance(results: dict) -> Grid:
+    """Every experiment in one table."""
+    ours = results['meta']['controllers']
+    rows: list[list[str]] = []
+    best = set()
+    for task, by_conditions in results['summary']['tasks'].items():
+        real = ' *' * PRINTED.get(kind_of(task), (0, False))[1]
+        for conditions, numbers in by_conditions.items():
+            for key, metric in METRICS[kind_of(task)].items():
+                if not metric.glance:
+                    continue
+                of = numbers['metrics'][key]
+                best |= {(len(rows), k) for k, name in enumerate(ours, 1)
+                         if name in of and of[name]['best']}
+                given = [printed(task, metric, name) if conditions == 'nominal' else {}
+                         for name in PUBLISHED]
+                rows.append([f'{task_title(task)}, {conditions}: {metric.title}', *(
+                    number(of[name]['mean'], metric.digits) if name in of else ABSENT
+                    for name in ours), *(
+                    number(entry.get('mean'), None) + real * bool(entry) for entry in given)])
+    rows.append(['CPU time of a step: median [ms]', *(
+        number(results['summary']['compute_ms'].get(name), 3) for name in ours),
+        *(f'{text} *' for text in COMPUTED)])
+    return Grid('All experiments', [
+        '', *(look(name).label for name in ours),
+        *(f'{look(name).label} (published)' for name in PUBLISHED)], rows, note=NOTES['glance'],
+        best=frozenset(best),
+        faint_columns=frozenset(range(len(ours) + 1, len(ours) + len(PUBLISHED) + 1)))
+
+
+def sections(results: dict, flown: dict) -> list[Section]:
+    """
+    Pictures and tables of all flights.
+
+    Args:
+        results: content of the JSON file.
+        flown: flights and their results with traces.
+
+    """
+    made = [Section('At a glance', '', [glance(results)])]
+    with matplotlib.rc_context(figures.STYLE):
+        for task, by_conditions in results['summary']['tasks'].items():
+            blocks: list[Grid | Picture] = []
+            for conditions in by_conditions:
+                blocks.append(table(results, task, conditions))
+                groups = plots.of(flown, task, conditions)
+                for name, caption, draw in plots.DRAWN.get(kind_of(task), ()):
+                    if groups and (figure := draw(groups, task)):
+                        blocks.append(Picture(f'{kind_of(task)}_{name}_{conditions}',
+                                              f'{caption} ({conditions} conditions)',
+                                              png(figure)))
+            made.append(Section(task_title(task), TEXTS.get(kind_of(task), ''), blocks))
+    return made
+
+
+def png(figure: Figure) -> bytes:
+    """Figure as PNG with few colours, a third of the full size."""
+    buffer, small = BytesIO(), BytesIO()
+    figure.savefig(buffer, format='png', dpi=DOTS)
+    Image.open(buffer).convert('RGB').quantize(COLOURS, dither=Image.Dither.NONE).save(
+        small, format='png', optimize=True)
+    return small.getvalue()
+
+
+def content(results: dict, made: list[Section]) -> dict:
+    """What both forms of the page show: terms with their meaning, facts, sections, flights."""
+    meta = results['meta']
+    terms = []
+    for name in meta['controllers']:
+        what = look(name).text or meta['specs'].get(name, '')
+        terms.append((look(name).label, f"{what}; guidance: {meta['guidance'][name]}"))
+    terms += [(f'{name} conditions', CONDITIONS[name]) for name in meta['conditions']]
+    terms += [(f'{name}: not flown', reason) for name, reason in meta['skipped'].items()]
+    failed = sum(bool(flight['failure']) for flight in results['flights'])
+    facts = [f"beetle_omni_ros {meta['version']}"
+             + (f", commit {meta['commit']}" if meta.get('commit') else ''),
+             f"{len(results['flights'])} flights, {failed} failed; seeds "
+             f"{', '.join(map(str, meta['seeds']))}",
+             f"{meta['cpu_s'] / 60:.1f} core minutes on {meta['processor']}",
+             *([f"simulated plant: {meta['plant']}"] if meta['plant'] else []),
+             *(f'{look(name).label}: policy {digest}'
+               for name, digest in meta['policies'].items())]
+    flights = Grid('', ['task', 'conditions', 'controller', 'seed', 'end', 'core s'], [
+        [flight['task'], flight['conditions'], flight['controller'], str(flight['seed']),
+         flight['failure'] or flight['metrics'].get('ended')
+         or ('touched the ground' if flight['metrics']['crashed'] else 'flown'),
+         number(flight['cpu_s'], 1)] for flight in results['flights']])
+    return {'title': TITLE, 'terms': terms, 'facts': facts, 'sections': made, 'flights': flights,
+            'command': meta['command']}

@@ -1,0 +1,250 @@
+"""
+Numbers of a comparison: metrics of all flights of one task and conditions, by controller.
+
+The summary is part of the JSON file, and the page takes each of its numbers from it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+
+from beetle_omni_ros.bags.metrics import at, CRASHED, failed, POSE_KEYS
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.tasks import PUSH_PERIOD, RISING, TILTS
+from beetle_omni_ros.flight.compared_flights import Flight
+from beetle_omni_ros.flight.statistics import compared
+from beetle_omni_ros.show import table as published
+
+PREFIX = 'published_'    # prefix of a controller in the publication
+# Colours of controllers outside the package, chosen by name.
+SPARE = ('#2a9d4b', '#7b4fb0', '#008c95', '#a0522d', '#6b7f1e')
+CONDITIONS = {
+    'nominal': 'simulator as measured: multibody plant, second-order servos, rotor lag, sensor '
+               'noise, every delay, state estimation by the EKF',
+    'published': "the same with the publication's randomisation, drawn from the seed: mass, "
+                 'inertia, centre of mass, sensor biases, more noise, latencies',
+}
+# Column of the publication's numbers -> its name there.
+PUBLISHED = {f'{PREFIX}{name}': entry.label for name, entry in reversed(
+    registry.SHIPPED.items()) if entry.label in published.RANDOM_POSES}
+# Kind of a task -> published numbers, and whether they are of the real robot.
+PRINTED: dict[str, tuple[dict, bool]] = {
+    'random': (published.RANDOM_POSES, False), 'waypoints': (published.WAYPOINTS, True),
+    'lemniscate': (published.LEMNISCATE, True), 'wind': (published.WIND, True),
+    'pushes': (published.PUSHED, True), **dict.fromkeys(RISING, (published.DISTURBANCE, False))}
+TITLES = {'waypoints': 'Five waypoints', 'lemniscate': '3D lemniscate',
+          'lemniscate_large': 'Large 3D lemniscate', 'force': 'Force disturbance',
+          'torque': 'Torque disturbance', 'force_down': 'Force downwards',
+          'force_up': 'Force upwards', 'torque_pulses': 'Torque pulses', 'wind': 'Fan',
+          'pushes': 'Stick pushes', 'payload': 'Payload', 'hover': 'Steady hover'}
+
+
+@dataclass(frozen=True)
+class Look:
+    """Label and text of a controller, and its line: colour and dashes."""
+
+    label: str
+    text: str
+    colour: str
+    dashes: str | tuple = '-'
+
+
+def look(controller: str) -> Look:
+    """Look of a controller, or of its published counterpart."""
+    name = controller.removeprefix(PREFIX)
+    entry = registry.SHIPPED.get(name)
+    if entry is None:
+        return Look(name, '', SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1)))
+    if name != controller:
+        return Look(entry.label, 'the publication', entry.line[0], ':')
+    return Look(entry.label, entry.description, *entry.line)
+
+
+def kind_of(task: str) -> str:
+    """Kind of a task: 'random', 'poses' for a pose file, or its name."""
+    return task if task in TITLES else 'random' if task[6:].isdigit() else 'poses'
+
+
+def task_title(task: str) -> str:
+    """Heading of a task."""
+    return TITLES.get(task) or (f'{task[6:]} random poses' if kind_of(task) == 'random'
+                                else f'Poses of {Path(task).name}')
+
+
+@dataclass(frozen=True)
+class Metric:
+    """
+    A number that a flight has once, or once for each pose.
+
+    Attributes:
+        title: its name with the unit.
+        digits: displayed digits.
+        of: function of the metrics of a flight: the number, or the list of those of its poses.
+        printed: path of the published mean.
+        more: whether more is better.
+        glance: whether it is in the table of all experiments.
+
+    """
+
+    title: str
+    digits: int
+    of: Callable[[dict], Any]
+    printed: str = ''
+    more: bool = False
+    glance: bool = False
+
+
+def _at(title, digits, path, printed='', **options):
+    """Metric at a path of keys in the metrics of a flight."""
+    return Metric(title, digits, lambda judged: at(judged, path), printed, **options)
+
+
+def _poses():
+    names = ('U ‖p error‖ [m]', 'U ‖θ error‖ [deg]', 'L ‖p error‖ [m]', 'L ‖θ error‖ [deg]')
+    made = {key: Metric(name, digits, lambda judged, key=key: [
+        pose[key] for pose in judged['poses']], f'mean.{key}', glance=True)
+        for key, name, digits in zip(POSE_KEYS, names, (4, 2, 3, 2), strict=True)}
+    return {
+        **made,
+        'reached': Metric('poses reached [%]', 1, lambda judged: [
+            100.0 * pose['reached'] for pose in judged['poses']], more=True, glance=True),
+        'speed': _at('‖v‖ at the target [m/s]', 4, *2 * ['hover_speed_mean_m_s']),
+        'rate': _at('‖ω‖ at the target [rad/s]', 4, *2 * ['hover_angular_speed_mean_rad_s']),
+        'joint_error': _at('|q* − q| [rad]', 4, *2 * ['joint_error_mean_rad']),
+        'joint_error_hover': _at('|q* − q| at the target [rad]', 4, 'joint_error_hover_mean_rad'),
+        'thrust': _at('thrust f* [N]', 2, *2 * ['thrust_mean_N']), **_changes(False)}
+
+
+def _changes(glance):
+    """Changes of the commands in 10 ms at the target."""
+    return {f'change_{key}': _at(f'{name} command change in 10 ms, RMS [{unit}]', digits,
+                                 f'hover_command_change_rms.{key}', glance=glance)
+            for key, name, unit, digits in (('joint_rad', 'tilt', 'rad', 5),
+                                            ('thrust_N', 'thrust', 'N', 4))}
+
+
+def _waypoints():
+    means = {key: _at(metric.title, metric.digits, *2 * [metric.printed],
+                      glance=key in POSE_KEYS[:2])
+             for key, metric in _poses().items() if key in POSE_KEYS}
+    return {**means, 'reached': Metric('poses reached [%]', 1, lambda judged: 100.0 * (
+        judged['success_rate'] or 0.0), more=True)}
+
+
+def _errors(kind):
+    """Mean and largest errors of a trajectory or a hover."""
+    made = {}
+    for name, unit, digits in (('position', 'm', 4), ('orientation', 'deg', 3)):
+        path = f'{name}_mean_{unit}'
+        made[name] = _at(f'{name} error [{unit}]', digits, f'{kind}.{path}', path, glance=True)
+        made[f'{name}_max'] = _at(f'largest {name} error [{unit}]', digits,
+                                  f'{kind}.{name}_max_{unit}')
+    return made
+
+
+def _disturbance(kind, _, levels, *times):
+    unit = 'N' if kind == 'force' else 'N_m'
+    beyond = 2.0 * levels[-1] - levels[-2]
+
+    def lost(judged):
+        level = judged[kind][f'lost_at_{unit}']
+        return float(beyond if level is None else level)
+
+    return {'lost': Metric(f"control lost at [{unit.replace('_', ' ')}]", 1, lost,
+                           f'{kind}_{unit}', more=True, glance=True)}
+
+
+def _wind():
+    made = {}
+    for name, unit, digits in (('position', 'm', 4), ('orientation', 'deg', 2)):
+        for part, text in (('mean', 'error'), ('std', 'standard deviation')):
+            path = f'{name}_{part}_{unit}'
+            made[path] = _at(f'strongest wind: {name} {text} [{unit}]', digits, f'wind.-1.{path}',
+                             path, glance=True)
+    return made
+
+
+def _pushes():
+    def recovery(judged):
+        return float(np.mean([PUSH_PERIOD if push['recovery_s'] is None else push['recovery_s']
+                              for push in judged['pushes']['pushes']]))
+
+    speed, rate = 'speed_mean_m_s', 'angular_speed_mean_rad_s'
+    return {'recovery': Metric('recovery to 0.02 m and 2 deg [s]', 2, recovery, glance=True),
+            'speed': _at('mean speed [m/s]', 3, f'pushes.{speed}', speed),
+            'rate': _at('mean body rate [rad/s]', 3, f'pushes.{rate}', rate)}
+
+
+def _payload():
+    def worst(judged):
+        found = [entry['height_error_m'] for entry in judged['payload']]
+        return None if None in found else max(map(abs, found))
+
+    return {'worst': Metric('largest height error [m]', 4, worst, glance=True)}
+
+
+METRICS: dict[str, dict[str, Metric]] = {
+    'random': _poses(), 'poses': _poses(), 'waypoints': _waypoints(),
+    **{name: _errors('trajectory') for name in TILTS}, 'wind': _wind(), 'pushes': _pushes(),
+    **{name: _disturbance(*of) for name, of in RISING.items()}, 'payload': _payload(),
+    'hover': {**_errors('hover'), **_changes(True)}}
+
+
+def summarise(flown: dict[Flight, dict]) -> dict:
+    """
+    Summarise results of :func:`fly_flight`.
+
+    Returns:
+        ``tasks``: task -> conditions -> ``flights`` (controller -> seeds, failures, lost) and
+        ``metrics`` (name in :data:`METRICS` -> :func:`statistics.compared`); ``compute_ms``:
+        controller -> CPU time of a step, median of the flights' medians.
+
+    """
+    summary: dict = {}
+    groups: dict[tuple, dict] = {}
+    for flight, result in flown.items():
+        groups.setdefault((flight.task, flight.conditions), {}).setdefault(
+            flight.controller, {})[flight.seed] = result
+    for (task, conditions), by_name in groups.items():
+        judged = {name: {seed: by_seed[seed]['metrics'] for seed in sorted(by_seed)
+                         if by_seed[seed]['metrics']} for name, by_seed in by_name.items()}
+        summary.setdefault(task, {})[conditions] = {
+            'flights': {name: {
+                'seeds': sorted(by_seed),
+                'failures': {str(seed): result['failure'] for seed, result in by_seed.items()
+                             if result['failure']},
+                'lost': sum(failed(one) == CRASHED for one in judged[name].values())}
+                for name, by_seed in by_name.items()},
+            'metrics': {key: compared({name: _sample(metric, by_seed)
+                                       for name, by_seed in judged.items()}, metric.more)
+                        for key, metric in METRICS[kind_of(task)].items()}}
+    times: dict[str, list] = {}
+    for flight, result in flown.items():
+        median = at(result, 'metrics.compute_ms.median')
+        if median is not None:
+            times.setdefault(flight.controller, []).append(median)
+    return {'tasks': summary, 'compute_ms': {
+        name: float(np.median(values)) for name, values in times.items()}}
+
+
+def _sample(metric, by_seed):
+    """Values of a controller by (seed,), or by (seed, pose)."""
+    sample = {}
+    for seed, judged in by_seed.items():
+        value = metric.of(judged)
+        sample |= {(seed, k): each for k, each in enumerate(value)} \
+            if isinstance(value, list) else {(seed,): value}
+    return sample
+
+
+def printed(task: str, metric: Metric, column: str) -> dict:
+    """Published mean of a metric, with std, min and max where they are printed; {} for none."""
+    numbers, real = PRINTED.get(kind_of(task), ({}, False))
+    found = numbers.get(PUBLISHED[column] + ', real robot' * real, {})
+    parts = ('mean', 'std', 'min', 'max') if 'mean' in metric.printed else ('mean',)
+    return {part: value for part in parts
+            if (value := at(found, metric.printed.replace('mean', part))) is not None}

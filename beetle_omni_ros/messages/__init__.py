@@ -1,1 +1,0 @@
-"""Topics, their messages and the values in them, for nodes and bags."""

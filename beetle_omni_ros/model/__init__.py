@@ -1,0 +1,1 @@
+"""Model of the robot: parameters, dynamics, effects, allocation, rotations."""

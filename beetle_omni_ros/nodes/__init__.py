@@ -1,1 +1,0 @@
-"""rclpy nodes: adapters between messages and the pure core."""

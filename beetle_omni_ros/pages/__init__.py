@@ -1,1 +1,0 @@
-"""HTML pages of results: structure, tables, figures and interactive charts."""

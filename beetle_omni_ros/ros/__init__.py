@@ -1,0 +1,1 @@
+"""rclpy nodes: one adapter between the topics of a component and ROS."""

@@ -1,0 +1,121 @@
+"""ROS nodes beside the control loop: targets of a task, recorder, the frame for viewers."""
+
+from functools import partial
+import sys
+
+from rcl_interfaces.srv import SetParameters
+
+from beetle_omni_ros.bags.bag_writer import BagWriter, FRAMES, FrameWriter
+from beetle_omni_ros.bags.topics import ALL, LATCHED_LOG, LOG, SENSOR, topics_with
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.flight.component import Component, ERROR, OK, WARN
+from beetle_omni_ros.flight.reference import Reference
+from beetle_omni_ros.model.schema import parameter, RunError
+from beetle_omni_ros.ros import wire
+from beetle_omni_ros.ros.node import FlightNode
+
+LINE = 'rcl_interfaces/msg/Log'
+WRITE_PERIOD = 0.02     # s between writes of the received messages, so that no callback waits
+FLUSH_WRITES = 20       # writes between flushes; a crash loses only messages after the last one
+
+
+class ReferenceNode(FlightNode):
+    """Node of the targets of a task."""
+
+    def __init__(self):
+        super().__init__(
+            'reference_node',
+            task=parameter('hover', doc='name of a task, or a CSV file of poses'),
+            seed=parameter(0, doc='seed of random poses', low=0, high=2**31 - 1))
+        payload = self.create_client(SetParameters, 'sim_node/set_parameters')
+        self.run(Reference(
+            make_task(self.parameters.task, self.parameters.seed),
+            lambda mass: payload.call_async(wire.parameter_request('payload', mass))))
+
+
+class RecorderNode(FlightNode):
+    """Writes every topic of the package and /rosout into a bag, like ``ros2 bag record``."""
+
+    def __init__(self):
+        super().__init__(
+            'recorder_node',
+            bag=parameter(doc='folder to create for the bag'),
+            controllers=parameter(registry.STANDING_BY,
+                                  doc='registered controllers whose commands are recorded'))
+        topics = topics_with(self.parameters.controllers)
+        self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
+                              topics=tuple(topics), frames=True)
+        self._written = self._lost = self._writes = 0
+        self._failure = None
+        self._received = []     # (topic, type, CDR, time of receipt [s]) not yet written
+        prefix = self.get_namespace().rstrip('/') + '/'
+        for name, topic in {**ALL, **topics}.items():
+            wire.subscribe_raw(self, name, partial(self._keep, prefix + name, topic.type),
+                               LATCHED_LOG if topic.qos.latched else LOG, self._on_lost)
+        self.create_subscription(wire.message_class(LINE), '/rosout', partial(
+            self._keep, '/rosout', LINE), wire.profile(LATCHED_LOG), raw=True)
+        component = Component('recorder_node')
+        component.report('bag', self._bag_status)
+        component.every(WRITE_PERIOD, self._write, steady=True)
+        self.run(component)
+
+    def _keep(self, topic, message_type, data, *_):
+        if not self._failure:       # nothing would empty the list any more
+            self._received.append((topic, message_type, data, self.now()))
+
+    def _write(self):
+        # Before the first /clock the time is 0: a bag that begins in 1970 cannot be viewed.
+        if self._failure or not self._bag or not self.now():
+            return
+        received, self._received = self._received, []
+        try:
+            for topic, message_type, data, t in received:
+                self._bag.write_raw(topic, message_type, data, t or self.now())
+            self._written += len(received)
+            self._writes += 1
+            if self._writes % FLUSH_WRITES == 0:
+                self._bag.flush()
+        except RunError as error:
+            # A full disk ends the recording but not the process, which is shared with other nodes.
+            self._failure = str(error)
+            self.get_logger().error(f'recording ended: {error}')
+
+    def _on_lost(self, event):
+        new = event.total_count_change
+        self._lost += new if new < 2**31 - 1 else 1     # so Fast DDS reports an unknown number
+        self.warn('lost', f'{self._lost} messages lost so far')
+
+    def _bag_status(self):
+        values = {'written': self._written, 'lost': self._lost}
+        if self._failure:
+            return ERROR, self._failure, values
+        return WARN if self._lost else OK, self.parameters.bag, values
+
+    def close(self):
+        """Finish the bag; a second call does nothing."""
+        try:
+            if self._bag:
+                self._write()
+                self._bag.close()
+        except RunError as error:
+            print(f'recorder_node: error: {error}', file=sys.stderr)
+        self._bag = None
+
+
+class ViewerNode(FlightNode):
+    """Publishes description and frames of the robot for RViz and Foxglove, like those of a bag."""
+
+    def __init__(self):
+        super().__init__('viewer_node')
+        self._outputs = {     # tf2_msgs is not on PyPI
+            name: self.create_publisher(wire.message_class(kind), name, wire.profile(qos))
+            for name, (kind, qos) in FRAMES.items()}
+        frames = FrameWriter(self._write, '')
+        for topic in ('odom', 'joint_states'):
+            wire.subscribe_raw(self, topic, lambda data, topic=topic: frames.take(
+                topic, data, self.now()), SENSOR)
+        self.run(Component('viewer_node'))
+
+    def _write(self, topic, kind, data, t):
+        self._outputs[topic].publish(bytes(data))

@@ -1,1 +1,0 @@
-"""Recorded flights: bags, tasks, metrics, plots and reports."""

@@ -1,1 +1,0 @@
-"""Arming, command selection, limits and fallback."""

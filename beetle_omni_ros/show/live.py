@@ -1,0 +1,81 @@
+"""A running graph in 3D."""
+
+import time
+from typing import Any
+
+import numpy as np
+import viser
+
+from beetle_omni_ros.bags.log import FAULT_KEY, Recorder
+from beetle_omni_ros.show.scene import Moment, Room, target_at
+
+RATE = 30.0             # [Hz]
+LOW, HIGH = np.array([-1.8, -1.8, 0.0]), np.array([1.8, 1.8, 2.0])      # [m] seen at the start
+
+
+class Newest(Recorder):
+    """Newest value of each topic."""
+
+    def __init__(self):
+        self.values: dict[str, Any] = {}        # topic -> value
+        self.statuses: dict[str, Any] = {}      # name -> newest diagnostic status
+
+    def write(self, topic: str, value: Any, received: float | None = None) -> None:
+        """Keep one value."""
+        if topic == 'diagnostics':
+            self.statuses.update((status.name, status) for status in value)
+        else:
+            self.values[topic] = value
+
+    def _body(self):
+        return self.values.get('ground_truth/odom', self.values.get('odom'))
+
+    def moment(self) -> Moment | None:
+        """Return what is shown now; None before the first pose."""
+        body, values = self._body(), self.values
+        if body is None:
+            return None
+        made = Moment(body.position, body.quaternion, state=values.get('supervisor/state', ''))
+        if 'joint_states' in values:
+            made.tilt = values['joint_states'].position
+        if 'command' in values:
+            made.thrust = np.nan_to_num(values['command'].thrust)
+        if 'disturbance' in values:
+            made.force = values['disturbance'].force
+        targets = sorted((values[topic] for topic in ('target_pose', 'target_trajectory')
+                          if topic in values), key=lambda target: target.stamp)
+        if targets:
+            made.target = target_at(targets[-1:], max(body.stamp, targets[-1].stamp))
+        return made
+
+    def text(self, moment: Moment) -> str:
+        """Return state, errors, battery, faults and warnings as Markdown."""
+        lines = [f'**{self._body().stamp:.1f} s**', moment.text()]
+        estimate, battery = self.values.get('odom'), self.values.get('battery_state')
+        if estimate is not None and 'ground_truth/odom' in self.values:
+            away = np.linalg.norm(estimate.position - moment.position)
+            lines.append(f'estimate {1e3 * away:.0f} mm off')
+        if battery is not None:
+            lines.append(f'battery {battery.voltage:.1f} V')
+        for status in self.statuses.values():
+            lines += [f'**{key}**' for key in status.values if key.startswith(FAULT_KEY)]
+            if status.level:
+                lines.append(f'{status.name}: {status.message}')
+        return '\n\n'.join(lines)
+
+
+def draw(server: viser.ViserServer, graph) -> None:
+    """Draw a :class:`~beetle_omni_ros.ros.operator.LiveGraph` as it runs, until Ctrl-C."""
+    newest, room = Newest(), Room(server)
+    room.look_at(LOW, HIGH)
+    shown = server.gui.add_markdown('')
+    while True:
+        time.sleep(1 / RATE)
+        graph.take(newest)
+        moment = newest.moment()
+        with server.atomic():
+            if moment:
+                room.show([moment], [''])
+            text = newest.text(moment) if moment else graph.waits()
+            if shown.content != text:
+                shown.content = text

@@ -1,0 +1,246 @@
+"""Result tables of flights."""
+
+from collections.abc import Callable
+
+from rich.console import Console
+
+from beetle_omni_ros.bags.metrics import at
+from beetle_omni_ros.show.page import ABSENT, Grid, number, print_grids, Terminal
+
+FILES, SHIPPED_ROBOT = ('robot', 'plant'), 'params/robot.yaml'    # keys in the metadata
+MANY_POSES = 20  # above this number, only the summary is shown
+
+POSE_ROWS = 'U: hovering, 7.0 to 7.5 s after each target; L: on the way, 1 to 7 s'
+ERROR_ROWS = (  # text, path in the metrics, digits
+    ('U position, mean [m]', 'mean.U_position_m', 4),
+    ('U position, max [m]', 'max.U_position_m', 4),
+    ('U orientation, mean [deg]', 'mean.U_orientation_deg', 2),
+    ('U orientation, max [deg]', 'max.U_orientation_deg', 2),
+    ('L position, mean [m]', 'mean.L_position_m', 3),
+    ('L position, max [m]', 'max.L_position_m', 3),
+    ('L orientation, mean [deg]', 'mean.L_orientation_deg', 2),
+    ('L orientation, max [deg]', 'max.L_orientation_deg', 2))
+EFFORT_ROWS = (
+    ('|q* - q| [rad]', 'joint_error_mean_rad', 4),
+    ('thrust [N]', 'thrust_mean_N', 2),
+    ('hover speed [m/s]', 'hover_speed_mean_m_s', 4),
+    ('hover rate [rad/s]', 'hover_angular_speed_mean_rad_s', 4),
+    ('hover tilt change [rad/10 ms]', 'hover_command_change_rms.joint_rad', 4),
+    ('hover thrust change [N/10 ms]', 'hover_command_change_rms.thrust_N', 3),
+    ('CPU of a step, median [ms]', 'compute_ms.median', 2),
+    ('CPU of a step, 99 % [ms]', 'compute_ms.p99', 2),
+    ('CPU of a step, max [ms]', 'compute_ms.max', 2),
+    ('deadline misses', 'compute_ms.deadline_misses', 0))
+
+# Published results of the same tasks, in the form of our metrics. Source: Zhang et al., Learning
+# Agile and Robust Omnidirectional Aerial Motion on Overactuated Tiltable-Quadrotors: tables of
+# continuous pose reaching in simulation (100 random poses) and in the real world (five waypoints),
+# and the text on tracking.
+RANDOM_POSES = {
+    'NMPC': {'mean': {'U_position_m': 0.02, 'U_orientation_deg': 40.99,
+                      'L_position_m': 0.31, 'L_orientation_deg': 51.75},
+             'min': {'U_position_m': 0.002, 'U_orientation_deg': 0.41,
+                     'L_position_m': 0.09, 'L_orientation_deg': 6.38},
+             'max': {'U_position_m': 0.116, 'U_orientation_deg': 136.97,
+                     'L_position_m': 0.76, 'L_orientation_deg': 143.15},
+             'hover_speed_mean_m_s': 0.008, 'hover_speed_std_m_s': 0.0005,
+             'hover_angular_speed_mean_rad_s': 0.007, 'hover_angular_speed_std_rad_s': 0.003,
+             'joint_error_mean_rad': 0.004, 'joint_error_std_rad': 0.011,
+             'thrust_mean_N': 9.17, 'thrust_std_N': 3.48},
+    'RL': {'mean': {'U_position_m': 0.08, 'U_orientation_deg': 5.89,
+                    'L_position_m': 0.18, 'L_orientation_deg': 13.59},
+           'min': {'U_position_m': 0.014, 'U_orientation_deg': 0.34,
+                   'L_position_m': 0.06, 'L_orientation_deg': 0.75},
+           'max': {'U_position_m': 0.232, 'U_orientation_deg': 85.49,
+                   'L_position_m': 0.58, 'L_orientation_deg': 104.35},
+           'hover_speed_mean_m_s': 0.015, 'hover_speed_std_m_s': 0.049,
+           'hover_angular_speed_mean_rad_s': 0.012, 'hover_angular_speed_std_rad_s': 0.044,
+           'joint_error_mean_rad': 0.026, 'joint_error_std_rad': 0.074,
+           'thrust_mean_N': 10.08, 'thrust_std_N': 3.36},
+}
+
+WAYPOINTS = {  # real robot; poses in the order of tasks.WAYPOINTS
+    'NMPC, real robot': {'mean': {'U_position_m': 0.042, 'U_orientation_deg': 4.350},
+                         'max': {'U_position_m': 0.074, 'U_orientation_deg': 8.225}},
+    'RL, real robot': {'mean': {'U_position_m': 0.077, 'U_orientation_deg': 4.261},
+                       'max': {'U_position_m': 0.114, 'U_orientation_deg': 5.561}},
+}
+
+# Levels at which control was lost in Gazebo, from the text; other levels are not published.
+DISTURBANCE = {
+    'NMPC': {'force_N': 100.0, 'torque_N_m': 25.0},
+    'RL': {'force_N': 100.0, 'torque_N_m': 15.0},
+}
+
+LEMNISCATE = {
+    'NMPC, real robot': {'position_mean_m': 0.05, 'position_std_m': 0.02,
+                         'orientation_mean_deg': 5.19, 'orientation_std_deg': 2.46},
+    'RL, real robot': {'position_mean_m': 0.16, 'position_std_m': 0.04,
+                       'orientation_mean_deg': 8.06, 'orientation_std_deg': 2.45},
+}
+
+# Real robot, from the text: before a fan, and pushed by a stick.
+WIND = {
+    'NMPC, real robot': {'position_mean_m': 0.04, 'position_std_m': 0.028,
+                         'orientation_mean_deg': 4.27, 'orientation_std_deg': 1.32},
+    'RL, real robot': {'position_mean_m': 0.10, 'position_std_m': 0.005,
+                       'orientation_mean_deg': 3.55, 'orientation_std_deg': 0.63},
+}
+PUSHED = {
+    'NMPC, real robot': {'speed_mean_m_s': 0.033, 'angular_speed_mean_rad_s': 0.092},
+    'RL, real robot': {'speed_mean_m_s': 0.025, 'angular_speed_mean_rad_s': 0.081},
+}
+
+# Rise times of the same laboratory's NMPC: Li et al., Servo Integrated Nonlinear Model Predictive
+# Control for Overactuated Tiltable-Quadrotors (arXiv 2405.09871).
+RISE = {'x': 0.71, 'y': 0.70, 'z': 0.58, 'roll': 0.91, 'pitch': 0.89, 'yaw': 0.68}
+
+POSES = {'random100': RANDOM_POSES, 'waypoints': WAYPOINTS}     # of a task
+
+
+# Columns of a table: heading, path in a part, digits. {} stands for mean, std and max of an error.
+SPREADS = (('position mean ± std (max) [m]', 'position_{}_m', 3),
+           ('orientation mean ± std (max) [deg]', 'orientation_{}_deg', 2))
+PEAKS = (('peak position [m]', 'peak_position_m', 3),
+         ('peak orientation [deg]', 'peak_orientation_deg', 2))
+RECOVERY = *PEAKS, ('recovery [s]', 'recovery_s', 2)
+# Key of a result -> title of its table, heading and names of its parts, and columns.
+KINDS: dict[str, tuple[str, str, Callable, tuple]] = {
+    'trajectory': ('Trajectory tracking', 'round', lambda found: [
+        *_numbered(found['rounds']), ('all', found)], SPREADS),
+    'force': ('Disturbance: force', 'force [N]', lambda found: _levels(found, 'N'), PEAKS),
+    'torque': ('Disturbance: torque', 'torque [N m]', lambda found: _levels(found, 'N_m'),
+               RECOVERY),
+    'payload': ('Payload, steady errors', 'payload [kg]', lambda found: [
+        (f"{part['payload_kg']:g}", part) for part in found], (
+            ('height error [m]', 'height_error_m', 4),
+            ('orientation [deg]', 'orientation_deg', 2))),
+    'hover': ('Hover after 8 s', 'part', lambda found: [('all', found)], SPREADS),
+    'wind': ('Hover before a fan', 'wind', lambda found: [
+        (f"{part['speed_m_s']:g} m/s", part) for part in found], SPREADS),
+    'pushes': ('Stick pushes', 'push', lambda found: [
+        *_numbered(found['pushes']), ('all', found)], (
+            *RECOVERY, ('mean speed [m/s]', 'speed_mean_m_s', 3),
+            ('mean rate [rad/s]', 'angular_speed_mean_rad_s', 3))),
+    'steps': ('Step responses', 'step', lambda found: [(step['axis'], step) for step in found], (
+        ('rise [s]', 'rise_s', 2), ('settling [s]', 'settling_s', 2),
+        ('overshoot [%]', 'overshoot_percent', 1)))}
+
+
+def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
+    """
+    Make the tables of a result.
+
+    Args:
+        results: JSON of ``evaluate``, ``fly`` or ``report``; keys other than ``meta`` are labels.
+        with_poses: whether to show every pose; None: if there are at most 20.
+
+    """
+    task = str(results.get('meta', {}).get('task', ''))
+    by_label = {name: result for name, result in results.items() if name != 'meta'}
+    made = [_summary(by_label, task)]
+    for key, (title, heading, parts, columns) in KINDS.items():
+        found = [(label, *part) for label, result in by_label.items() if key in result
+                 for part in parts(result[key])]
+        if found:
+            others = {'trajectory': LEMNISCATE if task == 'lemniscate' else {}, 'wind': WIND,
+                      'pushes': PUSHED}.get(key, {})
+            printed = [(f'published {name}', 'all', part) for name, part in others.items()]
+            if key == 'steps':
+                printed = [('published NMPC', axis, {'rise_s': rise})
+                           for axis, rise in RISE.items()]
+            rows = [[label, name, *(_cell(part, path, digits) for _, path, digits in columns)]
+                    for label, name, part in found + printed]
+            made.append(Grid(title, ['', heading, *(text for text, *_ in columns)], rows,
+                             frozenset(range(len(found), len(rows)))))
+    groups: dict[tuple, dict] = {}      # results with equal targets, which one table compares
+    for label, result in by_label.items():
+        targets = tuple(round(v, 6) for pose in result['poses'] for v in pose['target'])
+        groups.setdefault(targets, {})[label] = result['poses']
+    for group in groups.values():
+        count = len(next(iter(group.values())))
+        if count and with_poses or (with_poses is None and 1 < count <= MANY_POSES):
+            made.append(_poses(group))
+    return made
+
+
+def _cell(part, path, digits):
+    if '{}' not in path:
+        return number(at(part, path), digits)
+    mean, std, worst = (number(part.get(path.format(what)), digits)
+                        for what in ('mean', 'std', 'max'))
+    return f'{mean} ± {std} ({worst})' if worst != ABSENT else f'{mean} ± {std}'
+
+
+def _levels(found, unit):
+    return [(f"{level[f'level_{unit}']:g}" + (' lost' if level['lost'] else ''), level)
+            for level in found['levels']]
+
+
+def _numbered(parts):
+    return [(str(k + 1), part) for k, part in enumerate(parts)]
+
+
+def _summary(by_label, task):
+    """Table with a column for each controller and published result, a row for each metric."""
+    others = POSES.get(task, {})
+    columns = [*by_label.values(), *others.values()]
+    # The only pose of a trajectory is its start: to reach it says nothing about the path.
+    posed = not all('trajectory' in result for result in by_label.values())
+    rows = [[text, *(_cell(column, path, digits) for column in columns)]
+            for text, path, digits in (ERROR_ROWS if posed else ())]
+    if posed:
+        rows.append(['poses reached', *(
+            _reached(column['poses']) if 'poses' in column else ABSENT for column in columns)])
+    if any('landing' in column for column in columns):
+        rows.append(['landing [m/s]', *(
+            ('fell, ' if at(column, 'landing.fell') else '') + _cell(
+                column, 'landing.speed_m_s', 2) for column in columns)])
+    if any('ended' in column for column in columns):
+        rows.append(['ended', *(column.get('ended', ABSENT) for column in columns)])
+    rows.append(['crashed', *({True: 'yes', False: 'no'}.get(column.get('crashed'), ABSENT)
+                              for column in columns)])
+    rows += [[text, *(_cell(column, path, digits) for column in columns)]
+             for text, path, digits in EFFORT_ROWS]
+    if any(column.get('guidance') for column in columns):
+        rows.append(['guidance', *(column.get('guidance') or ABSENT for column in columns)])
+    first = len(by_label) + 1
+    return Grid(POSE_ROWS if posed else 'Flight',
+                ['', *by_label, *(f'published {name}' for name in others)], rows,
+                faint_columns=frozenset(range(first, first + len(others))))
+
+
+def _reached(poses):
+    text = f"{sum(pose['reached'] for pose in poses)} of {len(poses)}"
+    hovered = sum('fallback' in pose for pose in poses)
+    return f'{text}, {hovered} in fallback' if hovered else text
+
+
+def _poses(by_label):
+    header = ['', 'x y z [m] roll pitch yaw [deg]'] + [
+        f'{name}: {what}' for name in by_label for what in ('U [m]', '[deg]')]
+    rows = []
+    for k, poses in enumerate(zip(*by_label.values(), strict=True)):
+        target = poses[0]['target']
+        row = [str(k + 1), ' '.join([*(f'{v:.2f}' for v in target[:3]),
+                                     *(f'{v:.0f}' for v in target[3:])])]
+        for pose in poses:
+            row += [number(pose['U_position_m'], 4) + ('' if pose['reached'] else ' ✗'),
+                    number(pose['U_orientation_deg'], 2)]
+        rows.append(row)
+    return Grid('Poses', header, rows)
+
+
+def title(meta: dict) -> str:
+    """Task, conditions, seed, and the robot files that are not the shipped ones."""
+    return ', '.join(f'{key} {meta[key]}' for key in ('task', 'conditions', 'seed', *FILES)
+                     if meta.get(key) not in (None, 'None')
+                     and (key not in FILES or str(meta[key]) != SHIPPED_ROBOT))
+
+
+def print_results(results: dict, console: Console | None = None) -> None:
+    """Print the tables of a result to the terminal."""
+    console = console or Terminal()
+    if known := title(results.get('meta', {})):
+        console.print(known, style='bold', highlight=False, markup=False)
+    print_grids(grids(results), console)

@@ -1,0 +1,1 @@
+"""State machine of a flight: arming, detectors, degraded flight, landing."""

@@ -1,0 +1,137 @@
+"""Checks of the commands of the controllers, and of the one that is sent."""
+
+from collections import Counter
+from math import isfinite
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.model.allocation import clipped
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.supervisor.events import Lateness, Silence
+
+FROZEN = 'the same numbers again'
+JUMP = 'implausible jump'
+
+TIMEOUT = 0.05          # [s] without a valid command: 5 periods of 100 Hz
+RETURN_AFTER = 0.5      # [s] of valid commands before a controller gets control (again)
+STALE_AFTER = 0.05      # [s] a command computed from an older state is refused
+AHEAD = 0.02            # [s] a stamp farther in the future comes from another clock
+OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by a factor of 3
+STEP = 1.0, 7.5         # [rad] and [N] at once: ten times what a joint can turn in a period, and
+                        # four times what a rotor can change. A jump of tilts alone is none: by far
+                        # targets on both sides a policy sets the rate of a joint
+SAME = 10               # commands or estimates in a row that are equal to the last digit
+
+
+class CommandStream:
+    """
+    Commands of one controller: the last accepted one, and refusals with reasons.
+
+    Attributes:
+        accepted: the last valid command, clipped to the ranges, or None.
+        refused: reason -> count.
+        silence: time since the last valid command.
+        ages: of the commands, also of refused ones.
+        good_for: time of valid commands without a gap or refusal, and not late [s].
+
+    """
+
+    def __init__(self, robot: RobotParameters, age_limit: float):
+        self._robot = robot
+        self.accepted: Command | None = None
+        self.refused = Counter[str]()
+        self._last_refusal = ''
+        self.silence, self.ages = Silence(TIMEOUT), Lateness(age_limit)
+        self.good_for = 0.0
+        self._offered: Command | None = None
+        self._same = 0
+
+    @property
+    def good(self) -> bool:
+        """Whether the controller may get control."""
+        return not self.silence.silent and self.good_for >= RETURN_AFTER - 1e-9
+
+    @property
+    def complaint(self) -> str:
+        """Why the controller may not get control, for messages."""
+        if self.silence.silent:
+            last = f'; last refused: {self._last_refusal}' if self._last_refusal else ''
+            return self.silence.text + last
+        if self.ages.late:
+            return self.ages.text
+        return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
+
+    def offer(self, command: Command, now: float, doubted: float = -np.inf) -> str:
+        """
+        Check one command; '' when a copy is stored, else the reason of the refusal.
+
+        ``doubted`` is the stamp of a refused estimate, which controllers also received [s].
+        """
+        self.ages.add(now - command.stamp)
+        reason, clean = self._check(command, now, doubted)
+        if reason:
+            self.refused[reason] += 1
+            self._last_refusal = reason
+            # A step to a new target causes one jump. Repeated jumps end in the timeout.
+            if reason != JUMP:
+                self.good_for = 0.0
+            return reason
+        self.accepted, self._last_refusal = clean, ''
+        self.silence.reset()
+        return ''
+
+    def tick(self, dt: float) -> None:
+        """``dt`` seconds passed."""
+        self.silence.tick(dt)
+        self.good_for = 0.0 if self.silence.silent or self.ages.late else self.good_for + dt
+
+    def forget(self) -> None:
+        """Accept any stamp, after a step of the clock."""
+        self.accepted = self._offered = None
+        self.silence = Silence(TIMEOUT)
+
+    def _check(self, command, now, doubted):
+        """Reason of a refusal and, without one, a copy within the limits."""
+        stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
+        clean = within_limits(command, self._robot)
+        if clean is None or not isfinite(stamp):
+            return 'not finite', None
+        if stamp == doubted:
+            return 'answers a refused estimate', None
+        if now - stamp > STALE_AFTER:
+            return 'stale stamp', None
+        if stamp - now > AHEAD:
+            return 'stamp in the future', None
+        if self.accepted is not None and stamp <= self.accepted.stamp:
+            return 'repeated or older stamp', None
+        if _apart(tilt, clean.tilt) > OVERSTEP * self._robot.joints.position_limit:
+            return 'tilt out of range', None
+        if _apart(thrust, clean.thrust) > OVERSTEP * self._robot.rotors.thrust_max:
+            return 'thrust out of range', None
+        before, self._offered = self._offered, clean
+        if before is None:
+            return '', clean
+        tilted, changed = _apart(clean.tilt, before.tilt), _apart(clean.thrust, before.thrust)
+        self._same = self._same + 1 if tilted == changed == 0 else 0
+        if self._same >= SAME:
+            return FROZEN, None
+        # Compared with the previous command, accepted or not: a single spike is refused, a real
+        # step is delayed by one period.
+        jumps = tilted > STEP[0] and changed > STEP[1]
+        return (JUMP, None) if jumps and stamp - before.stamp <= TIMEOUT else ('', clean)
+
+
+def _apart(a, b):
+    """Largest difference of two arrays of four numbers."""
+    return max(map(abs, (a - b).tolist()))
+
+
+def within_limits(command: Command, robot: RobotParameters) -> Command | None:
+    """Final check of the output: finite and clipped to the limits, or None."""
+    if not all(map(isfinite, [*command.tilt.tolist(), *command.thrust.tolist()])):
+        return None
+    limit = robot.joints.position_limit
+    return Command(command.stamp, clipped(command.tilt, -limit, limit),
+                   clipped(command.thrust, 0.0, robot.rotors.thrust_max))
+

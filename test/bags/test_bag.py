@@ -1,0 +1,155 @@
+"""Bags: round trip, independent readers, truncated files, refusals."""
+
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from synthetic_flights import (
+    fly,
+    write_command,
+    write_diagnostic,
+    write_imu,
+    write_joints,
+    write_request,
+    write_wrench,
+)
+
+from beetle_omni_ros.bags.bag import names_of, read_bag
+from beetle_omni_ros.bags.bag_types import new, to_bytes, TYPESTORE
+from beetle_omni_ros.bags.bag_writer import add_meta, BagWriter
+from beetle_omni_ros.bags.log import FlightLog, LogRecorder, Recorder
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.model.allocation import ALL_HEALTHY
+from beetle_omni_ros.model.schema import ParameterError
+
+META = {'task': 'lemniscate', 'conditions': 'nominal', 'seed': 4, 'version': '0.1.0'}
+
+
+@pytest.fixture(scope='module')
+def recorded(tmp_path_factory):
+    """One short flight in memory and in a bag."""
+    folder = tmp_path_factory.mktemp('bags') / 'flight'
+    memory = LogRecorder(META)
+    with BagWriter(folder, META) as writer:
+        fly(Recorder(memory, writer), make_task('lemniscate'), duration=4.0, start=50.0)
+        write_wrench(Recorder(memory, writer), 53.0, [0, 0, 3.0], [0.5, 0, 0])
+    return folder, memory.log()
+
+
+def assert_equal_logs(a: FlightLog, b: FlightLog):
+    for name, mine in vars(a).items():
+        theirs = getattr(b, name)
+        if isinstance(mine, np.ndarray):
+            tolerance = 1e-5 if name.startswith('battery') else 1e-9  # float32 in the message
+            np.testing.assert_allclose(mine, theirs, rtol=0, atol=tolerance, err_msg=name)
+    for mine, theirs in zip([*a.targets, *a.requests.values()],
+                            [*b.targets, *b.requests.values()], strict=True):
+        assert type(mine) is type(theirs)
+        for name, value in vars(mine).items():
+            np.testing.assert_allclose(value, getattr(theirs, name), atol=1e-9)
+    assert (a.states, a.compute, a.meta) == (b.states, b.compute, b.meta)
+    assert len(a.diagnostics) == len(b.diagnostics)
+
+
+@pytest.mark.parametrize('name', ['', 'flight.mcap'])
+def test_a_flight_round_trips_through_its_bag_named_by_folder_or_file(recorded, name):
+    folder, memory = recorded
+    log = read_bag(folder / name)
+    assert_equal_logs(memory, log)
+    assert log.warnings == []
+
+
+@pytest.mark.parametrize(('chunks', 'compression'), [
+    (False, CompressionType.NONE), (True, CompressionType.ZSTD)])
+def test_files_of_other_writers_give_the_same_messages(recorded, tmp_path, chunks, compression):
+    folder, memory = recorded
+    with (tmp_path / 'other.mcap').open('wb') as stream, \
+            (folder / f'{folder.name}.mcap').open('rb') as source:
+        writer = Writer(stream, use_chunking=chunks, compression=compression)
+        writer.start()
+        channels = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, 'cdr', writer.register_schema(schema.name, 'ros2msg', b''))
+            writer.add_message(channels[channel.id], message.log_time, message.data,
+                               message.publish_time)
+        writer.finish()
+    log = read_bag(tmp_path / 'other.mcap')
+    assert log.warnings == ['metadata.yaml is missing: the recorder did not finish']
+    log.meta = memory.meta      # is in metadata.yaml
+    assert_equal_logs(memory, log)
+
+
+def test_a_message_that_cannot_be_used_is_counted_and_loses_no_other(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        write_joints(writer, 1.0, np.ones(4), np.zeros(4))
+        odd = new('sensor_msgs/msg/JointState')
+        odd.name, odd.position = ['wheel'], np.ones(1)
+        writer.write_raw('/joint_states', odd.__msgtype__, to_bytes(odd, odd.__msgtype__), 2.0)
+        writer.write_raw('/odom', 'nav_msgs/msg/Odometry', b'\x00\x01\x00\x00', 2.5)
+        write_joints(writer, 3.0, np.ones(4), np.zeros(4))
+    log = read_bag(tmp_path / 'bag')
+    assert log.joint_t.tolist() == [1.0, 3.0]
+    assert any('joint_states: 1 messages not used' in w and 'gimbal1' in w for w in log.warnings)
+    assert any('odom: 1 messages not used' in w for w in log.warnings)
+
+
+def test_values_without_a_stamp_are_read_without_a_warning(tmp_path):
+    with BagWriter(tmp_path / 'bag', {}) as writer:
+        writer.write('supervisor/actuators', ALL_HEALTHY, 1.0)
+        writer.write('supervisor/target', None, 1.0)
+    assert not [line for line in read_bag(tmp_path / 'bag').warnings if 'not used' in line]
+
+
+def test_namespaces_are_removed_and_several_robots_refused(tmp_path):
+    with BagWriter(tmp_path / 'bag', namespace='robot1') as writer:
+        write_command(writer, 1.0, np.ones(4), np.ones(4))
+        write_request(writer, 'nmpc', 1.0, np.zeros(4), np.ones(4))
+        write_imu(writer, 2.0, (0, 0, 1), (0, 0, 0))
+    log = read_bag(tmp_path / 'bag')
+    assert (len(log.command_t), len(log.requests['nmpc'].t), len(log.imu_t)) == (1, 1, 1)
+    with BagWriter(tmp_path / 'both', namespace='robot1') as writer:
+        write_imu(writer, 2.0, (0, 0, 1), (0, 0, 0))
+        writer.write_raw('/robot2/imu/data_raw', 'sensor_msgs/msg/Imu', b'', 2.0)
+    with pytest.raises(ParameterError, match='several robots'):
+        read_bag(tmp_path / 'both')
+
+
+def test_a_folder_of_runs_is_refused_with_their_names(tmp_path):
+    for name in ('rl', 'nmpc'):
+        with BagWriter(tmp_path / 'runs' / name) as writer:
+            write_imu(writer, 1.0, (0, 0, 9.8), (0, 0, 0))
+    with pytest.raises(ParameterError, match='expected one of the runs in it: nmpc, rl$'):
+        read_bag(tmp_path / 'runs')
+
+
+def test_compute_times_come_from_the_diagnostics_of_the_nodes(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        for count in (10, 20):
+            write_diagnostic(writer, count, 'robot1/nmpc_node: compute', {
+                'median_ms': '0.2', 'p99_ms': '0.5', 'max_ms': count, 'deadline_misses': '1',
+                'count': count, 'wall_max_ms': 9})
+    log = read_bag(tmp_path / 'bag')
+    assert log.compute == {'nmpc': {'median': 0.2, 'p99': 0.5, 'max': 20.0,
+                                    'deadline_misses': 1, 'count': 20}}
+    assert len(log.compute_history['nmpc']) == 2
+
+
+def test_meta_data_can_be_added_to_a_finished_bag(tmp_path):
+    with BagWriter(tmp_path / 'bag', {'task': 'hover'}) as writer:
+        write_imu(writer, 1.0, (0, 0, 9.8), (0, 0, 0))
+    add_meta(tmp_path / 'bag', {'seed': 3})
+    assert read_bag(tmp_path / 'bag').meta == {'task': 'hover', 'seed': 3}
+    with AnyReader([tmp_path / 'bag'], default_typestore=TYPESTORE) as reader:
+        assert reader.message_count == 1
+
+
+@pytest.mark.parametrize('paths, names', [
+    (['/a/one', '/a/two'], ['one', 'two']), (['/a/one/bag', '/a/two/bag'], ['one/bag', 'two/bag']),
+    (['/a/1/x/bag', '/b/1/x/bag'], ['a/1/x/bag', 'b/1/x/bag'])])
+def test_recordings_have_distinct_names(paths, names):
+    assert names_of([Path(path) for path in paths]) == names

@@ -1,0 +1,120 @@
+"""The page of a comparison: complete, self-contained, and the numbers of its flights."""
+
+import io
+import json
+import re
+
+from made_flights import FAILED, made, made_sweep, TASKS
+import numpy as np
+import pytest
+from rich.console import Console
+
+from beetle_omni_ros.flight import compare as command
+from beetle_omni_ros.flight import comparison_page as page
+from beetle_omni_ros.flight.compared_flights import Flight
+
+CONTROLLERS = ('rl', 'nmpc', 'nmpc_published')
+
+
+def written(folder, flown, tasks=TASKS, skipped=()):
+    """Write the page of ``flown`` and read back page, JSON and Markdown."""
+    conditions = list(dict.fromkeys(flight.conditions for flight in flown))
+    results = command.results_of(flown, tasks, conditions, dict.fromkeys(CONTROLLERS, 'none'),
+                                 dict(skipped))
+    folder.mkdir(exist_ok=True)
+    command.write(results, flown, folder, Console(file=io.StringIO(), width=160))
+    return (folder / 'comparison.html').read_text(), \
+        json.loads((folder / 'comparison.json').read_text()), (folder / 'README.md').read_text()
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+    """Folder, page, JSON and Markdown of a whole comparison, with coarse pictures to save time."""
+    folder = tmp_path_factory.mktemp('comparison')
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, 'DOTS', 50)
+        return folder, *written(folder, made_sweep(CONTROLLERS))
+
+
+def table_of(results, title):
+    return next(block for section in page.sections(results, {}) for block in section.blocks
+                if block.title.startswith(title))
+
+
+def row_of(table, title):
+    return next(k for k, row in enumerate(table.rows) if row[0] == title)
+
+
+def test_numbers_of_a_table_follow_from_the_flights_and_are_on_both_pages(whole):
+    _, html, numbers, text = whole
+    for conditions in ('nominal', 'published'):
+        table = table_of(numbers, f'3 random poses, {conditions}')
+        assert table.rows[0][0].startswith('U ‖p error‖ [m]')
+        means = []
+        for column, controller in enumerate(CONTROLLERS, 1):
+            found = [pose['U_position_m'] for flight in numbers['flights']
+                     for pose in flight['metrics']['poses']
+                     if (flight['task'], flight['conditions'], flight['controller'])
+                     == ('random3', conditions, controller)]
+            assert len(found) == 6
+            cell, means = table.rows[0][column], [*means, np.mean(found)]
+            low, high = map(float, re.fullmatch(r'[\d.]+ \[([\d.]+), ([\d.]+)\]', cell).groups())
+            assert cell.startswith(f'{means[-1]:.4f} ') and low < means[-1] < high
+            assert cell in html and cell in text
+            assert table.rows[2][column] == f'{min(found):.4f} to {max(found):.4f}'
+        # every flight of a later controller is worse than the same one of an earlier controller
+        assert table.rows[1][1] == '–' and (0, 1) in table.best
+        for column in (2, 3):
+            assert table.rows[1][column].startswith(f'{means[column - 1] - means[0]:.4f} [0.')
+    glance = table_of(numbers, 'All experiments')
+    row = row_of(glance, '3 random poses, published: U ‖p error‖ [m]')
+    assert glance.rows[row][1] == f'{means[0]:.4f}' and (row, 1) in glance.best
+
+
+def test_the_page_needs_no_network(whole):
+    _, html, _, _ = whole
+    for part in ('http://', 'https://', '<script', '<link', 'url(', '@import'):
+        assert part not in html
+    assert set(re.findall(r'src="(\w+:)', html)) == {'data:'}
+
+
+def test_published_numbers_keep_their_printed_form(whole):
+    table = table_of(whole[2], '3 random poses, nominal')
+    row = row_of(table, 'U ‖θ error‖ [deg]')
+    assert table.rows[row][-1] == '40.99' and table.rows[row + 2][-1] == '0.41 to 136.97'
+    assert table.rows[row_of(table, '‖v‖ at the target [m/s]')][-1] == '0.008 ± 0.0005'
+
+
+def test_pictures_named_in_the_markdown_exist(whole):
+    folder, _, _, text = whole
+    names = re.findall(r'!\[[^\]]*\]\(([^)]+)\)', text)
+    assert len(names) == 14
+    for name in names:
+        assert (folder / name).read_bytes().startswith(b'\x89PNG')
+    assert {path.name for path in folder.glob('*.png')} == set(names)
+
+
+def test_failed_and_crashed_flights_are_reported_and_affect_no_other(tmp_path):
+    fell = made('waypoints', duration=21.0)
+    fell['metrics'].update(crashed=True, ended='emergency_stop: crash at 20.9 s')
+    lost = made('force', duration=13.0)
+    lost['metrics']['crashed'] = True
+    flown = {Flight('waypoints', 'nominal', 'rl', 0): FAILED,
+             Flight('waypoints', 'nominal', 'nmpc', 0): fell,
+             Flight('waypoints', 'nominal', 'nmpc_published', 0): made('waypoints'),
+             Flight('force', 'nominal', 'rl', 0): lost,
+             Flight('force', 'nominal', 'nmpc', 0): FAILED,
+             Flight('force', 'nominal', 'nmpc_published', 0): FAILED}
+    html, numbers, text = written(tmp_path, flown, ('waypoints', 'force'),
+                                  skipped={'rl_any': 'no such file'})
+    assert 'no take-off &lt;within&gt; 30 s' in html and '<within>' not in html
+    assert 'touched the ground' in html and 'crash at 20.9 s' in html
+    assert 'no such file' in html and 'no such file' in text
+    waypoints = numbers['summary']['tasks']['waypoints']['nominal']
+    assert waypoints['flights']['rl']['failures'] == {'0': FAILED['failure']}
+    assert [waypoints['flights'][name]['lost'] for name in CONTROLLERS] == [0, 1, 0]
+    reached = waypoints['metrics']['reached']
+    assert reached['nmpc']['mean'] == pytest.approx(200 / 15)
+    assert [reached[name]['count'] for name in CONTROLLERS[1:]] == [1, 1]
+    force = numbers['summary']['tasks']['force']['nominal']['metrics']
+    assert force['lost']['rl']['mean'] == 30.0

@@ -1,0 +1,204 @@
+"""
+Flights of real processes, and consequences of a killed process.
+
+Each test has its own ROS domain and folders, so that tests can run at the same
+time. The robot is observed through ground_truth/odom, which does not depend on other nodes.
+"""
+
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from synthetic_flights import fly, write_state, write_truth
+from witness import HEADER, READY, running_graph
+
+from beetle_omni_ros.bags.bag import read_bag
+from beetle_omni_ros.bags.bag_writer import BagWriter
+from beetle_omni_ros.bags.metrics import metrics
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.ros import fly as fly_module
+from beetle_omni_ros.ros.graph import Graph, in_simulated_time
+
+NODES = ('recorder_node', 'sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node',
+         'reference_node')
+
+
+def test_switches_and_the_loss_of_recorder_reference_controller_and_estimator(ros_domain,
+                                                                              tmp_path):
+    task, bag = tmp_path / 'poses.csv', tmp_path / 'bag'
+    task.write_text(HEADER + '0,0,1.1,0,0,0\n0.3,0,1.1,15,0,0\n' * 20)
+    parameters = {name: {} for name in (*NODES, 'rl_node')}
+    parameters['recorder_node'] = {'bag': str(bag)}
+    parameters['reference_node'] = {'task': str(task)}
+    with running_graph(in_simulated_time(parameters), tmp_path, ros_domain,
+                       groups={name: [name] for name in parameters},
+                       ready=lambda one: one.ready and one.progress) as (graph, witness):
+        witness.take_off()
+        switches(witness)
+        loses_one_node_after_another(graph, witness, bag)
+
+
+def switches(witness):
+    """Select each controller; test/evaluation checks that no command jumps."""
+    names = ['rl', 'nmpc']
+    for name in names:
+        assert witness.stays_in_the_air(0.5)
+        assert witness.wait(lambda name=name: witness.set(
+            'supervisor_node', 'controller', name)[0], 10)
+        assert witness.wait(lambda name=name: witness.state == f'flying:{name}', 2), witness.states
+    assert not witness.set('supervisor_node', 'controller', 'pid')[0]
+    first = witness.states.index('flying:nmpc')
+    assert witness.states[first:] == ['flying:nmpc', *(f'flying:{name}' for name in names)]
+
+
+def loses_one_node_after_another(graph, witness, bag):
+    killed_at = witness.truth.stamp
+    graph.kill('recorder_node')
+    assert witness.stays_in_the_air(0.5)
+    log = read_bag(bag)
+    assert killed_at - 0.6 < log.imu_t[-1] < killed_at + 0.1
+    assert len(log.imu_t) > 400 and len(log.command_t) > 100 and log.targets
+
+    graph.kill('reference_node')
+    assert witness.stays_in_the_air(0.5)
+    assert witness.state == 'flying:nmpc'
+
+    graph.kill('nmpc_node')
+    assert witness.wait(lambda: witness.state == 'fallback', 2)
+    assert witness.stays_in_the_air(1.5)
+    assert np.linalg.norm(witness.truth.velocity) < 0.5
+    assert witness.wait(lambda: 'nmpc_node silent' in graph.log('supervisor_node').read_text(), 5)
+
+    graph.kill('ekf_node')
+    assert witness.wait(lambda: witness.state == 'landing', 5), witness.states
+    # the state is published before the line is logged
+    assert witness.wait(lambda: 'ekf_node silent' in graph.log('supervisor_node').read_text(), 5)
+    sinking = []
+    assert witness.wait(lambda: sinking.append(witness.truth.velocity[2])
+                        or witness.state == 'disarmed', 15)
+    assert min(sinking) > -0.8                  # controlled, no fall
+    witness.spin(1)
+    assert witness.truth.position[2] < 0.4 and np.linalg.norm(witness.truth.velocity) < 0.1
+    assert np.all(witness.last_command[1].thrust == 0)
+    assert set(graph.dead()) == {'recorder_node', 'reference_node', 'nmpc_node', 'ekf_node'}
+    assert 'SIGKILL' in graph.dead()['ekf_node']
+
+
+@contextmanager
+def flying(tmp_path):
+    """Fly ten poses by the command line; yield process and bag in flight."""
+    task, bag, temporary = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'tmp'
+    task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
+    temporary.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--task', str(task), '--bag',
+         str(bag), '--alone', '--clock', 'simulated'], stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE, text=True, env={**os.environ, 'TMPDIR': str(temporary)})
+    deadline = time.monotonic() + READY
+    try:
+        while not any(b'flying:nmpc' in file.read_bytes() for file in bag.glob('*.mcap')):
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.2)
+        yield process, bag
+    finally:
+        process.kill()
+        process.communicate()
+    assert not list(temporary.iterdir())
+
+
+def test_a_killed_process_is_named(tmp_path):
+    with flying(tmp_path) as (process, bag):
+        child, = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
+        os.kill(int(child), signal.SIGKILL)
+        _, error = process.communicate(timeout=30)      # nobody waits for its answer
+    assert process.returncode == 1
+    assert 'composed died (ended by SIGKILL)' in error
+
+
+def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
+    with flying(tmp_path) as (process, bag):
+        for _ in range(2):
+            process.send_signal(signal.SIGTERM)
+            time.sleep(0.1)
+        printed, error = process.communicate(timeout=60)
+    first, *_, last = printed.splitlines()
+    assert first.startswith('to watch: beetle_omni view --domain-id ')
+    assert last == f'interrupted; kept {bag}' and 'interrupted at ' in printed
+    assert error == 'beetle_omni: error: interrupted\n'
+    assert process.returncode == 130
+    log = read_bag(bag)
+    assert not log.warnings and log.states[-1] == 'flying:nmpc' and log.meta['interrupted']
+    result = metrics(log, make_task(str(tmp_path / 'poses.csv')))
+    assert not result['crashed'] and len(result['poses']) < 10
+
+
+def test_bridges_stop_first_except_in_flight(tmp_path, monkeypatch):
+    graph, ended = Graph({}, tmp_path, 0), []
+    graph.processes = {'composed': None, 'bridges': None}
+    monkeypatch.setattr(graph, '_end', lambda names: ended.extend(names) or [])
+    graph.stop()
+    graph.stop(in_flight=True)
+    assert ended == ['bridges', 'composed', 'composed', 'bridges']
+
+
+def test_warnings_are_in_the_order_of_time_each_once(tmp_path):
+    graph = Graph({}, tmp_path, 0)
+    graph.processes = {'one': None, 'two': None}
+    graph.log('one').write_text('[WARN] [20.5] [a]: late\n[INFO] [21.0] [a]: no matter\n'
+                                '[ERROR] [22.0] [b]: early\n')
+    graph.log('two').write_text('[ERROR] [19.0] [b]: first\n[WARN] [23.0] [b]: late\n')
+    assert graph.warnings() == ['[ERROR] [19.0] [b]: first', '[WARN] [20.5] [a]: late',
+                                '[ERROR] [22.0] [b]: early']
+
+
+@pytest.mark.parametrize('speed', [0.3, 3.0])
+def test_a_fall_in_the_landing_is_the_last_line_with_its_likely_cause(tmp_path, monkeypatch,
+                                                                      capfd, speed):
+    bag = tmp_path / 'bag'
+
+    def flown(graph, controller, task, *_):
+        with BagWriter(bag) as writer:
+            fly(writer, task)
+            for t in np.arange(10, 11, 0.005):
+                write_truth(writer, t, np.array([0, 0, 0.15]), np.array([0, 0, 0, 1.0]),
+                            np.array([0, 0, -speed * (t == 10)]), np.zeros(3))
+            write_state(writer, 10.5, 'disarmed')
+        return '', '; this computer was too slow'
+
+    monkeypatch.setattr(fly_module, '_fly', flown)
+    assert fly_module.run_fly(task='random1', bag=bag, standby=False) == (speed > 1)
+    out, err = capfd.readouterr()
+    if speed > 1:
+        assert err == ('beetle_omni fly: error: the robot fell in the landing; this computer was '
+                       'too slow\n')
+    else:
+        assert not err and out.splitlines()[-1] == 'this computer was too slow'
+    assert 'landing [m/s]' in out
+
+
+def test_the_computer_was_too_slow_if_the_simulator_lost_time_in_the_flight():
+    flight = object.__new__(fly_module.Flight)
+    for before, lost, slow in ((0.0, 0.4, True), (0.4, 0.45, False), (float('inf'), 3.0, False)):
+        flight._lost_before, flight._lost_time = before, lambda lost=lost: lost
+        assert ('try --clock simulated' in flight.slow()) is slow
+
+
+def test_a_full_disk_ends_the_flight_with_one_line_and_the_bag_is_readable(tmp_path):
+    task, bag, limit = tmp_path / 'poses.csv', tmp_path / 'bag', 3 * 2**20
+    task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
+    done = subprocess.run(
+        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--task', str(task), '--bag',
+         str(bag), '--alone', '--clock', 'simulated', '--controller', 'hover'],
+        capture_output=True, text=True, timeout=READY, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)))
+    assert done.returncode == 1
+    assert done.stderr == f'beetle_omni fly: error: {bag}: File too large\n'
+    assert len(done.stdout.splitlines()) == 1       # how to watch it
+    assert len(read_bag(bag).truth_t) > 100

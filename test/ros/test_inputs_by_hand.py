@@ -1,0 +1,72 @@
+"""Keys, joystick axes and typed commands give shifts and goals; other input is refused."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.ros import drive
+from beetle_omni_ros.ros.drive import Action, DriveParameters, parse
+
+
+@pytest.fixture(scope='module')
+def p():
+    return DriveParameters.load()
+
+
+def test_each_axis_has_two_opposite_keys(p):
+    total = [np.zeros(3), np.zeros(3)]
+    for key in drive.MOVES:
+        for sum_, part in zip(total, drive.shift_of_key(key, p)):
+            sum_ += part
+    assert not np.any(total) and {axis for axis, _ in drive.MOVES.values()} == set(range(6))
+    assert drive.shift_of_key('w', p)[0] == pytest.approx([p.step, 0, 0])
+    assert drive.shift_of_key('j', p)[1] == pytest.approx([0, 0, p.turn])
+    assert drive.shift_of_key('z', p) is None
+    assert not set(drive.MOVES) & set(drive.KEY_WORDS)
+
+
+def test_full_deflection_gives_the_speed_and_the_dead_zone_gives_zero(p):
+    axes = np.zeros(8)
+    for number, sign in zip(p.axes.astype(int), p.signs):
+        axes[number] = sign
+    way, turn = drive.shift_of_sticks(axes, 0.1, p)
+    assert way == pytest.approx([0.1 * p.speed] * 3) and turn == pytest.approx([0.1 * p.rate] * 3)
+    way, turn = drive.shift_of_sticks(axes * p.dead_zone * 0.99, 0.1, p)
+    assert not way.any() and not turn.any()
+    half = drive.shift_of_sticks(axes * (p.dead_zone + (1 - p.dead_zone) / 2), 0.1, p)[0]
+    assert half == pytest.approx([0.05 * p.speed] * 3)
+
+
+@pytest.mark.parametrize(('line', 'way', 'turn'), [
+    ('up 0.3', [0, 0, 0.3], [0, 0, 0]), ('  DOWN 1 # slowly', [0, 0, -1], [0, 0, 0]),
+    ('right 0.5', [0, -0.5, 0], [0, 0, 0]), ('roll 180', [0, 0, 0], [np.pi, 0, 0]),
+    ('yaw -90', [0, 0, 0], [0, 0, -np.pi / 2])])
+def test_commands_that_shift_the_target(p, line, way, turn):
+    name, shift = parse(line, p.poses)
+    assert name == 'shift'
+    assert shift[0] == pytest.approx(way) and shift[1] == pytest.approx(turn)
+
+
+def test_commands_that_go_to_poses_and_that_request_actions(p):
+    name, over = parse('over', p.poses)
+    assert name == 'goto' and rotations.matrix(over[1])[2, 2] == pytest.approx(-1)
+    position, quaternion = parse('goto 1 0 1.5', p.poses).values
+    assert position == pytest.approx([1, 0, 1.5]) and quaternion is None
+    _, turned = parse('goto 1 0 1.5 0 0 90', p.poses).values
+    assert turned == pytest.approx([0, 0, 0.5 ** 0.5, 0.5 ** 0.5])
+    assert parse('arm', p.poses) == Action('arm')
+    assert parse('controller rl', p.poses) == Action('controller', ('rl',))
+    assert parse('wait 2', p.poses) == Action('wait', (2.0,))
+    assert parse('', p.poses) is None and parse('# nothing', p.poses) is None
+
+
+@pytest.mark.parametrize(('line', 'fragment'), [
+    ('up', 'expected up METRES'), ('up nan', 'METRES'), ('roll 200', 'at most 180'),
+    ('goto 1 2', 'X Y Z'), ('jump 3', "'jump': expected"), ('jump', 'or a pose of home'),
+    ('controller', 'NAME'), ('wait -1', 'SECONDS'), ('land now', 'nothing after')])
+def test_an_unknown_command_is_refused_with_the_expected_ones(p, line, fragment):
+    with pytest.raises(ParameterError) as raised:
+        parse(line, p.poses)
+    assert fragment in str(raised.value) and 'expected' in str(raised.value)
+    assert '\n' not in str(raised.value)

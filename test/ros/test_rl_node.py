@@ -1,0 +1,40 @@
+"""rl_node and its policy: commands, and which policy and controllers may stand by."""
+
+import pytest
+
+from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.ros.graph import controller_nodes
+from beetle_omni_ros.ros.runner import maker
+
+pytest.importorskip('onnx')
+
+from policy_files import write
+
+
+def test_the_executable_flies_the_given_policy(make, tmp_path):
+    node = make(maker('rl_node'), f"policy:={write(tmp_path / 'policy.onnx', bias=[0.1] * 8)}")
+    assert node.parameters.policy.endswith('policy.onnx')
+    assert node.component._controller_status()[2]['policy'] == 'rl'
+
+
+def test_files_reach_their_nodes_and_a_shipped_policy_that_does_not_fit_is_left_out(tmp_path):
+    policy = str(write(tmp_path / 'policy.onnx'))
+    other = {'robot_file': str(share_path('params/robot_weak_and_heavy.yaml'))}
+    nmpc = tmp_path / 'nmpc.yaml'
+    nmpc.write_text('limits: {velocity: 2.0}\n')
+    nodes, _ = controller_nodes('nmpc', {}, policy=policy, nmpc=str(nmpc))
+    assert list(nodes) == ['nmpc_node', 'rl_node']
+    assert nodes['nmpc_node'] == {'nmpc_file': str(nmpc)}
+    nodes, reason = controller_nodes('nmpc', other)
+    assert list(nodes) == ['nmpc_node'] and 'mass' in reason['rl']
+    nodes, reason = controller_nodes('nmpc', other, policy=policy, allow_other_robot=True)
+    assert nodes['rl_node'] == {**other, 'policy': policy, 'allow_other_robot': True}
+    # A policy that the user names is refused, also on standby, instead of being left out.
+    for active, robot, file, reason in (
+            ('rl', {}, 'none.onnx', 'no such file'), ('nmpc', {}, 'none.onnx', 'no such file'),
+            ('nmpc', other, policy, 'mass')):
+        with pytest.raises(ParameterError, match=reason):
+            controller_nodes(active, robot, policy=str(tmp_path / file))
+    with pytest.raises(ParameterError, match="--policy .*: for the controller 'rl', which does"):
+        controller_nodes('nmpc', {}, policy=policy, standby=False)
