@@ -171,7 +171,7 @@ def test_ctrl_c_keeps_what_was_flown_and_marks_it(poses, tmp_path, capsys, inter
 
 def test_a_full_disk_is_one_line_and_what_was_written_is_readable(poses, tmp_path):
     done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.cli', 'evaluate', '--controllers', 'hover',
+        [sys.executable, '-m', 'beetle_omni_ros', 'evaluate', '--controllers', 'hover',
          '--task', str(poses), '--bag', str(tmp_path / 'bag')], capture_output=True, text=True,
         check=False, preexec_fn=lambda: resource.setrlimit(
             resource.RLIMIT_FSIZE, (3 * 2**20, 3 * 2**20)))

@@ -98,7 +98,7 @@ def flying(tmp_path):
     task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
     temporary.mkdir()
     process = subprocess.Popen(
-        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--task', str(task), '--bag',
+        [sys.executable, '-m', 'beetle_omni_ros', 'fly', '--task', str(task), '--bag',
          str(bag), '--alone', '--clock', 'simulated'], stderr=subprocess.PIPE,
         stdout=subprocess.PIPE, text=True, env={**os.environ, 'TMPDIR': str(temporary)})
     deadline = time.monotonic() + READY
@@ -194,7 +194,7 @@ def test_a_full_disk_ends_the_flight_with_one_line_and_the_bag_is_readable(tmp_p
     task, bag, limit = tmp_path / 'poses.csv', tmp_path / 'bag', 3 * 2**20
     task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
     done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--task', str(task), '--bag',
+        [sys.executable, '-m', 'beetle_omni_ros', 'fly', '--task', str(task), '--bag',
          str(bag), '--alone', '--clock', 'simulated', '--controller', 'hover'],
         capture_output=True, text=True, timeout=READY, check=False,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)))
