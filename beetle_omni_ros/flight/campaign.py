@@ -33,8 +33,7 @@ from beetle_omni_ros.model.schema import ParameterError, RunError
 LIBRARIES = ('casadi', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
 SOURCE = Path(__file__).resolve().parents[1]
 # Folders whose code decides the numbers of a flight and its metrics.
-FLOWN = ('control', 'estimation', 'evaluation', 'messages', 'robot', 'runs', 'safety', 'sim',
-         'stack')
+FLOWN = ('bags', 'control', 'estimation', 'flight', 'model', 'sim', 'supervisor')
 LENGTH = 16  # hexadecimal digits kept of a digest
 OBJECT_STORE = 200 * 2**20  # [byte] shared memory of a local Ray; results are far smaller
 LOST_WORKER = ('TerminatedWorkerError', 'BrokenProcessPool', 'RayActorError', 'ActorDiedError',
@@ -59,9 +58,9 @@ def file_digest(path: str | Path) -> str:
 
 @cache
 def code_fingerprint(file: str) -> str:
-    """Digest of libraries, parameters, the folders FLOWN, and the ``file`` that flies them."""
+    """Digest of libraries, parameters, the folders FLOWN without pages, and a flying ``file``."""
     files = [path for folder in FLOWN for path in (SOURCE / folder).rglob('*')
-             if path.suffix in ('.py', '.c', '.h')]
+             if path.suffix in ('.py', '.c', '.h') and not path.stem.endswith('page')]
     files += [Path(file), *share_path('params').glob('*.yaml')]
     return digest(platform.machine(), *map(str, versions().values()), *(
         part for path in sorted(files, key=lambda path: (path.parent.name, path.name))
