@@ -14,7 +14,7 @@ import numpy as np
 
 from beetle_omni_ros.bags.bag_types import from_bytes, read_all
 from beetle_omni_ros.bags.conversions import from_nanoseconds
-from beetle_omni_ros.bags.log import FlightLog, LogRecorder, META_KEY, motion, SERIES_OF
+from beetle_omni_ros.bags.log import channels_of, FlightLog, LogRecorder, META_KEY, motion
 from beetle_omni_ros.bags.topics import ALL, controller_of, TELLING, topic_of, TOPICS
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.model.schema import ParameterError, read_yaml
@@ -227,7 +227,7 @@ class _Reading:
         topic = topic_of(name)
         if messages.type != topic.type:
             self._refuse(name, f'type is {messages.type}, not {topic.type}', len(messages.data))
-        elif name in SERIES_OF or controller_of(name):
+        elif channels_of(name):
             rows, value, refused = read_all(topic, messages.data)
             if len(rows):
                 received = messages.received[rows]

@@ -272,15 +272,15 @@ def _crashed(log, body, intervals):
 
 def _effort(log, body, intervals, windows):
     """Joint error |q* - q|, thrust, motion and change of the command in the U windows."""
-    stamps, first = np.unique(log.command_t, return_index=True)
-    command = np.hstack([log.command_tilt[first], log.command_thrust[first]])
+    stamps, first = np.unique(log.command.t, return_index=True)
+    command = np.hstack([log.command.tilt[first], log.command.thrust[first]])
     thrust = command[:, 4:]
-    joint = inside(log.joint_t, intervals)
-    joint &= log.joint_t >= (stamps[0] if len(stamps) else np.inf)
+    joint = inside(log.joint.t, intervals)
+    joint &= log.joint.t >= (stamps[0] if len(stamps) else np.inf)
     error = np.zeros((0, 4))
     if np.any(joint):
-        error = np.abs(hold(stamps, command[:, :4], log.joint_t[joint])
-                       - log.joint_position[joint])
+        error = np.abs(hold(stamps, command[:, :4], log.joint.t[joint])
+                       - log.joint.position[joint])
     still = inside(body.t, windows)
     speed = np.linalg.norm(body.velocity[still], axis=1)
     rate = np.linalg.norm(body.angular_velocity[still], axis=1)
@@ -298,7 +298,7 @@ def _effort(log, body, intervals, windows):
     return {'joint_error_mean_rad': _reduced(np.mean, error),
             'joint_error_std_rad': _reduced(np.std, error),
             'joint_error_hover_mean_rad': _reduced(
-                np.mean, error[inside(log.joint_t[joint], windows)]),
+                np.mean, error[inside(log.joint.t[joint], windows)]),
             'thrust_mean_N': _reduced(np.mean, used), 'thrust_std_N': _reduced(np.std, used),
             'thrust_hover_mean_N': _reduced(np.mean, thrust[inside(stamps, windows)]),
             'thrust_max_N': _reduced(np.max, used),

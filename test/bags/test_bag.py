@@ -20,7 +20,7 @@ from synthetic_flights import (
 from beetle_omni_ros.bags.bag import names_of, read_bag
 from beetle_omni_ros.bags.bag_types import new, to_bytes, TYPESTORE
 from beetle_omni_ros.bags.bag_writer import add_meta, BagWriter
-from beetle_omni_ros.bags.log import FlightLog, LogRecorder, Recorder
+from beetle_omni_ros.bags.log import FlightLog, LogRecorder, Recorder, SERIES
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.model.allocation import ALL_HEALTHY
 from beetle_omni_ros.model.schema import ParameterError
@@ -40,16 +40,15 @@ def recorded(tmp_path_factory):
 
 
 def assert_equal_logs(a: FlightLog, b: FlightLog):
-    for name, mine in vars(a).items():
-        theirs = getattr(b, name)
-        if isinstance(mine, np.ndarray):
-            tolerance = 1e-5 if name.startswith('battery') else 1e-9  # float32 in the message
-            np.testing.assert_allclose(mine, theirs, rtol=0, atol=tolerance, err_msg=name)
-    for mine, theirs in zip([*a.targets, *a.requests.values()],
-                            [*b.targets, *b.requests.values()], strict=True):
+    def parts(log):
+        return [*(getattr(log, name) for name in SERIES), *log.requests.values(), *log.targets]
+
+    for mine, theirs in zip(parts(a), parts(b), strict=True):
         assert type(mine) is type(theirs)
+        tolerance = 1e-5 if mine is a.battery else 1e-9     # float32 in the message
         for name, value in vars(mine).items():
-            np.testing.assert_allclose(value, getattr(theirs, name), atol=1e-9)
+            np.testing.assert_allclose(value, getattr(theirs, name), atol=tolerance)
+    assert np.allclose(a.state_t, b.state_t, rtol=0, atol=1e-9)
     assert (a.states, a.compute, a.meta) == (b.states, b.compute, b.meta)
     assert len(a.diagnostics) == len(b.diagnostics)
 
@@ -93,7 +92,7 @@ def test_a_message_that_cannot_be_used_is_counted_and_loses_no_other(tmp_path):
         writer.write_raw('/odom', 'nav_msgs/msg/Odometry', b'\x00\x01\x00\x00', 2.5)
         write_joints(writer, 3.0, np.ones(4), np.zeros(4))
     log = read_bag(tmp_path / 'bag')
-    assert log.joint_t.tolist() == [1.0, 3.0]
+    assert log.joint.t.tolist() == [1.0, 3.0]
     assert any('joint_states: 1 messages not used' in w and 'gimbal1' in w for w in log.warnings)
     assert any('odom: 1 messages not used' in w for w in log.warnings)
 
@@ -111,7 +110,7 @@ def test_namespaces_are_removed_and_several_robots_refused(tmp_path):
         write_request(writer, 'nmpc', 1.0, np.zeros(4), np.ones(4))
         write_imu(writer, 2.0, (0, 0, 1), (0, 0, 0))
     log = read_bag(tmp_path / 'bag')
-    assert (len(log.command_t), len(log.requests['nmpc'].t), len(log.imu_t)) == (1, 1, 1)
+    assert (len(log.command.t), len(log.requests['nmpc'].t), len(log.imu.t)) == (1, 1, 1)
     with BagWriter(tmp_path / 'both', namespace='robot1') as writer:
         write_imu(writer, 2.0, (0, 0, 1), (0, 0, 0))
         writer.write_raw('/robot2/imu/data_raw', 'sensor_msgs/msg/Imu', b'', 2.0)

@@ -178,7 +178,7 @@ def test_a_full_disk_is_one_line_and_what_was_written_is_readable(poses, tmp_pat
     line, = done.stderr.splitlines()
     assert done.returncode == 1 and line.startswith(f"beetle_omni: error: {tmp_path / 'bag'}: ")
     log = read_bag(tmp_path / 'bag')
-    assert len(log.truth_t) > 300 and 'cut off' in log.warnings[0]
+    assert len(log.truth.t) > 300 and 'cut off' in log.warnings[0]
 
 
 def test_an_empty_pack_is_swapped_at_the_next_target(monkeypatch):
@@ -190,7 +190,7 @@ def test_an_empty_pack_is_swapped_at_the_next_target(monkeypatch):
     log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)
     assert not log.meta['crashed']
     assert metrics(log, task)['success_rate'] == 1.0
-    drawn = -np.sum(log.battery_current[:-1] * np.diff(log.battery_t)) / 3600
+    drawn = -np.sum(log.battery.current[:-1] * np.diff(log.battery.t)) / 3600
     assert drawn > CAPACITY     # more than one pack holds
 
 

@@ -35,7 +35,7 @@ def test_a_trial_is_deterministic_and_its_bag_is_read_back(tmp_path):
     case = 'commands_lost_for_a_moment'
     first, again = flown(case, bags=tmp_path), flown(case)
     assert {**first, 'bag': ''} == again == json.loads(json.dumps(again))
-    assert len(read_bag(tmp_path / first['bag']).truth_t)
+    assert len(read_bag(tmp_path / first['bag']).truth.t)
     assert first['outcome'] == 'flies_on' and first['good'] and not first['error']
     assert 0.1 < first['impact_m_s'] < 1.0
 

@@ -36,9 +36,9 @@ def test_a_flight_through_drivers_and_emulated_devices_holds_its_target():
     assert np.linalg.norm(truth.position - [0, 0, 1.0]) < 0.1
     log = recorder.log()
     # Angles in counts of the encoder: they passed the registers of the servos.
-    counts = log.joint_position[-200:] / (2 * np.pi / 4096)
-    assert np.allclose(counts, np.round(counts), atol=1e-6) and len(log.joint_t) > 400
-    assert len(log.battery_t) > 4
+    counts = log.joint.position[-200:] / (2 * np.pi / 4096)
+    assert np.allclose(counts, np.round(counts), atol=1e-6) and len(log.joint.t) > 400
+    assert len(log.battery.t) > 4
 
 
 def test_faults_of_devices_need_direct_actuators():
