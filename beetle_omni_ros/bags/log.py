@@ -8,10 +8,8 @@ Times are float seconds on the flight's clock, ROS time in the graph. A loop rec
 
 from __future__ import annotations
 
-from array import array
 from collections import defaultdict
 from dataclasses import dataclass, field
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -48,6 +46,7 @@ COMPUTE_KEYS = {'median_ms': 'median', 'p99_ms': 'p99', 'max_ms': 'max',
 # [s] tolerance of a window's edges. Stamps are integer nanoseconds in a bag and floats in memory,
 # where UNIX time has a resolution of 0.24 us.
 EDGE = 1e-5
+TOGETHER = 1000     # values that a log converts to rows together
 SAME_TIME = 2.5e-3  # [s] between stamps of an estimate and of the truth that are compared
 
 
@@ -219,8 +218,9 @@ class LogRecorder(Recorder):
     """Collects a :class:`FlightLog`; see there for units and frames."""
 
     def __init__(self, meta: dict | None = None):
-        # topic -> flat rows: hours of flight fit
-        self._rows: dict[str, array] = defaultdict(partial(array, 'd'))
+        # topic -> its (N, W) rows of stamp and channels, and the values that are no rows yet
+        self._rows: dict[str, list[np.ndarray]] = defaultdict(list)
+        self._pending: dict[str, list] = defaultdict(list)
         self._targets: list[Target] = []
         self._states: list[tuple[float, Mode]] = []
         self._history: dict[str, list[tuple[float, dict]]] = defaultdict(list)
@@ -228,28 +228,31 @@ class LogRecorder(Recorder):
         self._meta = dict(meta or {})
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
-        """Record one value; other topics than those of a log are ignored."""
-        channels = channels_of(topic)
-        if channels is None:
+        """
+        Record one value, or one whose fields are arrays over several messages.
+
+        Other topics than those of a log are ignored.
+        """
+        if (channels := channels_of(topic)) is None:
             self._add_event(topic, value, received)
-            return
-        rows, stamp = self._rows[topic], value.stamp
-        parts = [((stamp if received is None else received) if channel == 'received' else
-                  getattr(value, channel), width) for channel, width in channels.items()]
-        if isinstance(stamp, np.ndarray):       # the fields are arrays over several messages
-            rows.frombytes(np.column_stack([stamp, *(
-                np.full((len(stamp), width), np.nan) if part is None else part
-                for part, width in parts)]).astype(float).tobytes())
-            return
-        row = [stamp]
-        for part, width in parts:
-            if not width:
-                row.append(part)
-            elif isinstance(part, np.ndarray):
-                row += part.tolist()    # floats are added faster than numpy's numbers
-            else:
-                row += [np.nan] * width if part is None else part
-        rows.fromlist(row)
+        elif isinstance(value.stamp, np.ndarray):
+            self._rows[topic].append(_rows(value, received, channels))
+        else:
+            pending = self._pending[topic]
+            pending.append((value, value.stamp if received is None else received))
+            if len(pending) == TOGETHER:
+                self._add_rows(topic)
+
+    def _add_rows(self, topic):
+        """Convert the pending values of a topic together, which is faster."""
+        values, received = zip(*self._pending.pop(topic), strict=True)
+        channels = channels_of(topic)
+        together = SimpleNamespace(stamp=[value.stamp for value in values])
+        for name in channels.keys() - {'received'}:
+            parts = [getattr(value, name) for value in values]
+            setattr(together, name, np.array([
+                np.full(channels[name], np.nan) if part is None else part for part in parts]))
+        self._rows[topic].append(_rows(together, received, channels))
 
     def _add_event(self, topic, value, received):
         """Add a target, a state of the supervisor or diagnostics."""
@@ -278,6 +281,8 @@ class LogRecorder(Recorder):
         targets = list({(target.stamp, type(target)): target for target in sorted(
             self._targets, key=lambda target: target.stamp)}.values())
         states = sorted(self._states, key=lambda entry: entry[0])
+        for topic in list(self._pending):
+            self._add_rows(topic)
         return FlightLog(
             **{name: _series(self._rows.get(topic, ()), channels)
                for name, (topic, channels) in SERIES.items()},
@@ -293,11 +298,19 @@ def channels_of(topic: str) -> dict[str, int] | None:
     return CHANNELS.get(topic) or (_COMMAND if topic.endswith('/command') else None)
 
 
+def _rows(value, received, channels):
+    """Return (N, W) rows of stamp and channels of a value whose fields are arrays."""
+    parts = [received if name == 'received' else getattr(value, name) for name in channels]
+    return np.column_stack([value.stamp, *(
+        np.full((len(value.stamp), width), np.nan) if part is None else part
+        for part, width in zip(parts, channels.values(), strict=True))]).astype(float)
+
+
 def _series(rows, channels):
-    """Sort flat rows by time into 't' and the channels."""
+    """Sort rows by time into 't' and the channels."""
     widths = {'t': 0, **channels}
     ends = np.cumsum([max(1, width) for width in widths.values()])
-    table = np.array(rows, dtype=float).reshape(-1, ends[-1])
+    table = np.concatenate([np.zeros((0, ends[-1])), *rows])
     table = table[np.argsort(table[:, 0], kind='stable')]
     return Series(**{name: (table[:, end - width:end] if width else table[:, end - 1]).copy()
                      for (name, width), end in zip(widths.items(), ends, strict=True)})

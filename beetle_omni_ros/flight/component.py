@@ -305,7 +305,9 @@ class Component:
     # Health -----------------------------------------------------------------------------------
 
     def timed(self, function: Callable, *args):
-        """Call ``function`` and count its CPU time."""
+        """Call ``function`` and, in real time, count its CPU time."""
+        if self.host.simulated:
+            return function(*args)
         begin = time.thread_time()
         result = function(*args)
         self.took(time.thread_time() - begin)
@@ -325,6 +327,8 @@ class Component:
         """All statuses of this component."""
         statuses = []
         for part, source in self._reports:
+            if part == 'compute' and not self._compute.count:
+                continue
             level, text, values = source()
             statuses.append(Diagnostic(
                 self.host.now(), f'{self.name}: {part}', level, text,
