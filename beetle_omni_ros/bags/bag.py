@@ -1,21 +1,29 @@
 """Reading of rosbag2 folders (metadata.yaml and MCAP) without ROS, also of truncated files."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields, replace
 from itertools import islice
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 from mcap.exceptions import InvalidMagic
 from mcap.reader import NonSeekingReader
 import numpy as np
 
-from beetle_omni_ros.bags.bag_types import from_bytes, read_all
 from beetle_omni_ros.bags.conversions import from_nanoseconds
-from beetle_omni_ros.bags.log import channels_of, FlightLog, LogRecorder, META_KEY, motion
-from beetle_omni_ros.bags.topics import ALL, controller_of, TELLING, topic_of, TOPICS
+from beetle_omni_ros.bags.log import (
+    channels_of,
+    FlightLog,
+    LogRecorder,
+    META_KEY,
+    motion,
+    stacked,
+)
+from beetle_omni_ros.bags.messages import from_bytes
+from beetle_omni_ros.bags.topics import ALL, controller_of, TELLING, Topic, topic_of, TOPICS
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.model.schema import ParameterError, read_yaml
 
@@ -166,6 +174,27 @@ def read_together(path: str | Path, warnings: list[str] | None = None
                for (topic, kind), (data, times) in groups.items()]
 
 
+def read_all(topic: Topic, messages: Sequence[bytes | memoryview]) -> tuple[
+        np.ndarray, SimpleNamespace, Counter]:
+    """
+    Read the messages of a topic whose values have numbers, arrays or None as fields.
+
+    Returns:
+        (M,) ascending indices of the readable messages; the values :func:`.log.stacked`; reason
+        -> number of refused messages.
+
+    """
+    rows, values, refused = [], [], Counter()
+    for row, data in enumerate(messages):
+        try:
+            values.append(topic.read(from_bytes(data, topic.type)))
+            rows.append(row)
+        except Exception as error:      # broken bytes raise anything
+            refused[str(error) or type(error).__name__] += 1
+    names = [entry.name for entry in fields(topic.value) if entry.name != 'names']
+    return np.array(rows, dtype=int), stacked(values, names), refused
+
+
 def read_bag(path: str | Path) -> FlightLog:
     """
     Read a flight.
@@ -231,8 +260,8 @@ class _Reading:
             rows, value, refused = read_all(topic, messages.data)
             if len(rows):
                 received = messages.received[rows]
-                stamp = np.where(value.stamp == 0, received, value.stamp)
-                self.recorder.write(name, replace(value, stamp=stamp), received)
+                value.stamp = np.where(value.stamp == 0, received, value.stamp)
+                self.recorder.write(name, value, received)
             self._counts[name] += len(rows)
             for reason, number in refused.items():
                 self._refuse(name, reason, number)

@@ -16,9 +16,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.serde import SerdeError
 import yaml
 
-from beetle_omni_ros.bags.bag_types import from_bytes, new, offered, to_bytes, TYPESTORE
 from beetle_omni_ros.bags.conversions import BODY, nanoseconds, WORLD
 from beetle_omni_ros.bags.log import META_KEY, Recorder
+from beetle_omni_ros.bags.messages import from_bytes, new, offered, to_bytes, TYPESTORE
 from beetle_omni_ros.bags.topics import ALL, EVENT, LATCHED, Qos, topic_of, TOPICS
 from beetle_omni_ros.model.files import write_text
 from beetle_omni_ros.model.schema import ParameterError, read_yaml, RunError

@@ -1,8 +1,7 @@
 """
 Conversion between messages and values, by attribute access only.
 
-``read_*`` also converts messages of ``read_all``, whose numbers are arrays over N messages, so
-vectors have the shape (N, 3). ``take_joints`` converts one message for use in flight.
+``take_joints`` converts a message for use in flight.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.bags.bag_types import new
-from beetle_omni_ros.bags.values import Diagnostic, MessageError, Wrench
+from beetle_omni_ros.bags.messages import Diagnostic, MessageError, new, Wrench
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.model import readings, rotations
 from beetle_omni_ros.model.allocation import ActuatorHealth
@@ -59,13 +57,13 @@ def set_time(time: Any, t: float) -> None:
 
 
 def xyz(v: Any) -> np.ndarray:
-    """Return the three fields as an array (3,) or (N, 3)."""
-    return np.array([v.x, v.y, v.z]).T
+    """Return the three fields as an array (3,)."""
+    return np.array([v.x, v.y, v.z])
 
 
 def xyzw(q: Any) -> np.ndarray:
-    """Return the four fields as an array (4,) or (N, 4)."""
-    return np.array([q.x, q.y, q.z, q.w]).T
+    """Return the four fields as an array (4,)."""
+    return np.array([q.x, q.y, q.z, q.w])
 
 
 def set_parts(v: Any, values: Sequence[float] | np.ndarray) -> None:
@@ -125,7 +123,7 @@ def vectors(value: type, name: str, frame: str, **places: str
 
     def read(message):
         return value(stamp=seconds(message.header.stamp), **{
-            attribute: np.array(parts(message)).T if parts else whole(message)
+            attribute: np.array(parts(message)) if parts else whole(message)
             for attribute, _, whole, parts in found})
 
     def write(value):
@@ -179,12 +177,7 @@ def write_battery(value: readings.BatteryReading) -> Any:
 def read_odom(message: Any) -> BodyState:
     """Read pose and velocity; the velocity is rotated from base_link to world."""
     odom = _read_odom(message)
-    q, velocity = odom.quaternion, odom.velocity
-    if velocity.ndim == 1:
-        return replace(odom, velocity=rotations.matrix(q) @ velocity)
-    axis, w = q[:, :3], q[:, 3:]
-    swept = 2 * np.cross(axis, velocity)
-    return replace(odom, velocity=velocity + w * swept + np.cross(axis, swept))
+    return replace(odom, velocity=rotations.matrix(odom.quaternion) @ odom.velocity)
 
 
 def write_odom(value: Any) -> Any:
@@ -212,12 +205,12 @@ def read_pose_target(message: Any) -> PoseTarget:
 # --- messages of joints -------------------------------------------------------------------------
 
 def _of(message, field, names):
-    """Values (len(names),) or (N, len(names)) of a field of a JointState, by name."""
+    """Values (len(names),) of a field of a JointState, by name."""
     values = getattr(message, field)
     try:
         order = range(len(names)) if message.name[:len(names)] == names else \
             [message.name.index(name) for name in names]
-        return np.array([values[k] for k in order], dtype=float).T
+        return np.array([values[k] for k in order], dtype=float)
     except ValueError:
         raise MessageError(f"names are not {', '.join(names)}") from None
     except IndexError:

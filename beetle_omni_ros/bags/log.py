@@ -9,13 +9,14 @@ Times are float seconds on the flight's clock, ROS time in the graph. A loop rec
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.bags.values import Diagnostic
+from beetle_omni_ros.bags.messages import Diagnostic
 from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.mode import FALLBACK, Mode
@@ -247,12 +248,8 @@ class LogRecorder(Recorder):
         """Convert the pending values of a topic together, which is faster."""
         values, received = zip(*self._pending.pop(topic), strict=True)
         channels = channels_of(topic)
-        together = SimpleNamespace(stamp=[value.stamp for value in values])
-        for name in channels.keys() - {'received'}:
-            parts = [getattr(value, name) for value in values]
-            setattr(together, name, np.array([
-                np.full(channels[name], np.nan) if part is None else part for part in parts]))
-        self._rows[topic].append(_rows(together, received, channels))
+        self._rows[topic].append(_rows(
+            stacked(values, {'stamp', *channels} - {'received'}), received, channels))
 
     def _add_event(self, topic, value, received):
         """Add a target, a state of the supervisor or diagnostics."""
@@ -296,6 +293,17 @@ class LogRecorder(Recorder):
 def channels_of(topic: str) -> dict[str, int] | None:
     """Return the channels of the series of a topic; None for events."""
     return CHANNELS.get(topic) or (_COMMAND if topic.endswith('/command') else None)
+
+
+def stacked(values: Sequence[Any], names: Iterable[str]) -> SimpleNamespace:
+    """Return one object for N values: each name an array with N rows, NaN for None; or None."""
+    columns: dict[str, np.ndarray | None] = {}
+    for name in names:
+        parts = [getattr(value, name) for value in values]
+        known = next((part for part in parts if part is not None), None)
+        columns[name] = None if known is None and values else np.array(
+            [np.full(np.shape(known), np.nan) if part is None else part for part in parts])
+    return SimpleNamespace(**columns)
 
 
 def _rows(value, received, channels):

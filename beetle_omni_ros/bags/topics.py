@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from beetle_omni_ros.bags import conversions as c
-from beetle_omni_ros.bags.values import Diagnostic, Wrench
+from beetle_omni_ros.bags.messages import Diagnostic, Wrench
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.model.allocation import ActuatorHealth

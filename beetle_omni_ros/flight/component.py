@@ -17,8 +17,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from beetle_omni_ros.bags.messages import Diagnostic, MessageError
 from beetle_omni_ros.bags.topics import Qos
-from beetle_omni_ros.bags.values import Diagnostic, MessageError
 from beetle_omni_ros.supervisor.events import Answer
 from beetle_omni_ros.supervisor.supervisor import AGE_LIMIT
 

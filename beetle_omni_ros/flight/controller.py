@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from beetle_omni_ros.bags.messages import MessageError
 from beetle_omni_ros.bags.topics import TARGETS
-from beetle_omni_ros.bags.values import MessageError
 from beetle_omni_ros.control.base import (
     Controller,
     ControllerHost,

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from beetle_omni_ros.bags.messages import Wrench
 from beetle_omni_ros.bags.topics import SENSOR
-from beetle_omni_ros.bags.values import Wrench
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.tasks import Task, TaskPlayer, WITH_WRENCHES
 from beetle_omni_ros.flight.component import Component, OK

@@ -6,7 +6,7 @@ from math import degrees
 
 import numpy as np
 
-from beetle_omni_ros.bags.values import MessageError
+from beetle_omni_ros.bags.messages import MessageError
 from beetle_omni_ros.flight.component import COMMAND_AGE, Component, Distribution, ERROR, OK, WARN
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators

@@ -18,8 +18,8 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.bags.conversions import seconds as seconds_of
+from beetle_omni_ros.bags.messages import Diagnostic, MessageError
 from beetle_omni_ros.bags.topics import LOG, Qos, SENSOR, TARGETS, TOPICS
-from beetle_omni_ros.bags.values import Diagnostic, MessageError
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.drivers import findings
 from beetle_omni_ros.model.mode import DISARMED, Mode

@@ -18,9 +18,9 @@ from synthetic_flights import (
 )
 
 from beetle_omni_ros.bags.bag import names_of, read_bag
-from beetle_omni_ros.bags.bag_types import new, to_bytes, TYPESTORE
 from beetle_omni_ros.bags.bag_writer import add_meta, BagWriter
 from beetle_omni_ros.bags.log import FlightLog, LogRecorder, Recorder, SERIES
+from beetle_omni_ros.bags.messages import new, to_bytes, TYPESTORE
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.model.allocation import ALL_HEALTHY
 from beetle_omni_ros.model.schema import ParameterError

@@ -6,7 +6,7 @@ from desk import Desk
 import numpy as np
 import pytest
 
-from beetle_omni_ros.bags.values import Wrench
+from beetle_omni_ros.bags.messages import Wrench
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.estimation.parameters import EkfParameters

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.bags.bag import BagError, read_together
-from beetle_omni_ros.bags.bag_types import from_bytes, read_all
+from beetle_omni_ros.bags.bag import BagError, read_all, read_together
+from beetle_omni_ros.bags.messages import from_bytes
 from beetle_omni_ros.bags.topics import TOPICS
 from beetle_omni_ros.model.parameters import JOINT_NAMES, ROTOR_NAMES
 
