@@ -34,6 +34,7 @@ LIBRARIES = ('casadi', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
 SOURCE = Path(__file__).resolve().parents[1]
 # Folders whose code decides the numbers of a flight and its metrics.
 FLOWN = ('bags', 'control', 'estimation', 'flight', 'model', 'sim', 'supervisor')
+PAGES = ('comparison_page', 'faults', 'summary')     # and code that decides none
 LENGTH = 16  # hexadecimal digits kept of a digest
 OBJECT_STORE = 200 * 2**20  # [byte] shared memory of a local Ray; results are far smaller
 LOST_WORKER = ('TerminatedWorkerError', 'BrokenProcessPool', 'RayActorError', 'ActorDiedError',
@@ -60,7 +61,7 @@ def file_digest(path: str | Path) -> str:
 def code_fingerprint(file: str) -> str:
     """Digest of libraries, parameters, the folders FLOWN without pages, and a flying ``file``."""
     files = [path for folder in FLOWN for path in (SOURCE / folder).rglob('*')
-             if path.suffix in ('.py', '.c', '.h') and not path.stem.endswith('page')]
+             if path.suffix in ('.py', '.c', '.h') and path.stem not in PAGES]
     files += [Path(file), *share_path('params').glob('*.yaml')]
     return digest(platform.machine(), *map(str, versions().values()), *(
         part for path in sorted(files, key=lambda path: (path.parent.name, path.name))

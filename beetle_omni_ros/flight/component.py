@@ -9,7 +9,7 @@ one process (:mod:`.loop`) and a ROS node (:class:`beetle_omni_ros.ros.node.Flig
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 import math
 import time
@@ -19,6 +19,9 @@ import numpy as np
 
 from beetle_omni_ros.bags.messages import Diagnostic, MessageError
 from beetle_omni_ros.bags.topics import Qos
+from beetle_omni_ros.control.registry import loaded, snake_case
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.supervisor.events import Answer
 from beetle_omni_ros.supervisor.supervisor import AGE_LIMIT
 
@@ -358,3 +361,29 @@ class Component:
                 faults.append(f'waiting for {topic}')
             entry.reported, entry.rejected_reported = entry.received, count
         return level, '; '.join(faults) or 'all arriving', values
+
+
+# --- components of others ----------------------------------------------------------------------
+
+def component_class(reference: str) -> type[Component]:
+    """
+    Load a subclass of Component, whose constructor takes the robot.
+
+    Raises:
+        ParameterError: there is none at ``reference``, 'FILE.py:Class' or 'package.module:Class'.
+
+    """
+    kind = loaded(reference)
+    if not (isinstance(kind, type) and issubclass(kind, Component)):
+        raise ParameterError(f"component '{reference}': {kind!r} is no subclass of Component")
+    return kind
+
+
+def node_name(kind: type[Component]) -> str:
+    """Name of the node of a component: 'wrench_observer_node' of WrenchObserver."""
+    return f'{snake_case(kind.__name__)}_node'
+
+
+def made(references: Iterable[str], robot: RobotParameters) -> list[Component]:
+    """Components of references; their topics are those of the table or registered ones."""
+    return [component_class(reference)(robot) for reference in references]

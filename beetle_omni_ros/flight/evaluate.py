@@ -20,8 +20,8 @@ from beetle_omni_ros.control.base import Controller, guidance_of, reach_of
 from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.control.targets import check_steps
 from beetle_omni_ros.control.tasks import make_task, Task
+from beetle_omni_ros.flight.component import made
 from beetle_omni_ros.flight.loop import FlightLoop
-from beetle_omni_ros.flight.plugin import made
 from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.show import table

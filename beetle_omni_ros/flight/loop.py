@@ -22,12 +22,14 @@ from beetle_omni_ros.control.base import Controller, PoseTarget, Target
 from beetle_omni_ros.control.tasks import Task
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight.component import Component, DIAGNOSTICS_PERIOD, Timer
-from beetle_omni_ros.flight.controller import CANNOT_BE_FLOWN, ControllerComponent
-from beetle_omni_ros.flight.estimator import Estimator
 from beetle_omni_ros.flight.process_faults import ProcessFaults
-from beetle_omni_ros.flight.reference import DONE, Reference, WAITING
-from beetle_omni_ros.flight.simulated import SimulatedRobot
-from beetle_omni_ros.flight.supervision import SupervisorComponent
+from beetle_omni_ros.flight.stack import (
+    CANNOT_BE_FLOWN,
+    ControllerComponent,
+    Estimator,
+    SupervisorComponent,
+)
+from beetle_omni_ros.flight.surroundings import DONE, Reference, SimulatedRobot, WAITING
 from beetle_omni_ros.model.mode import FLYING, IN_FLIGHT, MOTORS_OFF, TAKEOFF
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError

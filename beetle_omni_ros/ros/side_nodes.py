@@ -10,7 +10,7 @@ from beetle_omni_ros.bags.topics import ALL, LATCHED_LOG, LOG, SENSOR, topics_wi
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.component import Component, ERROR, OK, WARN
-from beetle_omni_ros.flight.reference import Reference
+from beetle_omni_ros.flight.surroundings import Reference
 from beetle_omni_ros.model.schema import parameter, RunError
 from beetle_omni_ros.ros import wire
 from beetle_omni_ros.ros.node import FlightNode

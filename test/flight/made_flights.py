@@ -8,7 +8,7 @@ from synthetic_flights import fly
 from beetle_omni_ros.bags.log import LogRecorder
 from beetle_omni_ros.bags.metrics import metrics
 from beetle_omni_ros.control.tasks import make_task
-from beetle_omni_ros.flight.compared_flights import Flight, trace
+from beetle_omni_ros.flight.compare import Flight, trace
 
 TASKS = ('random3', 'waypoints', 'lemniscate', 'force', 'torque', 'wind', 'pushes',
          'payload', 'hover')

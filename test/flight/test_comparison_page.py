@@ -11,7 +11,7 @@ from rich.console import Console
 
 from beetle_omni_ros.flight import compare as command
 from beetle_omni_ros.flight import comparison_page as page
-from beetle_omni_ros.flight.compared_flights import Flight
+from beetle_omni_ros.flight.compare import Flight
 
 CONTROLLERS = ('rl', 'nmpc', 'nmpc_published')
 

@@ -12,11 +12,8 @@ from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight import component as base
 from beetle_omni_ros.flight.component import COMMAND_AGE, Component, Distribution, IDENTITY
-from beetle_omni_ros.flight.controller import ControllerComponent
-from beetle_omni_ros.flight.estimator import Estimator
-from beetle_omni_ros.flight.reference import Reference
-from beetle_omni_ros.flight.simulated import SimulatedRobot
-from beetle_omni_ros.flight.supervision import SupervisorComponent
+from beetle_omni_ros.flight.stack import ControllerComponent, Estimator, SupervisorComponent
+from beetle_omni_ros.flight.surroundings import Reference, SimulatedRobot
 from beetle_omni_ros.model.allocation import ActuatorHealth
 from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.mode import Mode

@@ -10,7 +10,6 @@ from rich.console import Console
 
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.flight import campaign
-from beetle_omni_ros.flight import fault_page as page
 from beetle_omni_ros.flight import faults as command
 from beetle_omni_ros.flight.fault_flights import (
     fly_trial,
@@ -79,7 +78,7 @@ def result(case, **values):
 
 
 def results_of(flights):
-    return {'flights': flights, 'summary': page.summary(flights, CASES), 'meta': {
+    return {'flights': flights, 'summary': command.summary(flights, CASES), 'meta': {
         'command': 'beetle_omni faults', 'date': '2026-11-25', 'version': '0.1.0',
         'commit': 'abcdef0123'}}
 
@@ -92,7 +91,7 @@ def test_summary_counts_add_up():
              *(result('healthy', start='', outcome='flies_on', flown_s=1800.0, good=False,
                       alarms=[[1.0, 'error', 'y']]) for _ in range(2)),
              result('landing_without_mocap', start='', inclination_deg=4.0)]
-    totals = page.summary(flights, CASES)
+    totals = command.summary(flights, CASES)
     assert totals['faults']['gust']['outcomes'] == {'lands': 1, 'flyaway': 1}
     assert totals['faults']['gust']['impact_worst_m_s'] == 0.3
     assert totals['faults']['impact']['named_s'] == 0.2
@@ -108,12 +107,12 @@ def test_the_page_explains_its_outcomes_and_shows_each_flight():
                for start in ('hover', 'moving')]
     flights.append(result('gust', seed=4, outcome='crash, motors on', good=False,
                           impact_m_s=None, error='<b>'))
-    html = page.as_page(results_of(flights), Path('runs_out/faults'))
+    html = command.as_page(results_of(flights), Path('runs_out/faults'))
     for text in ('commit abcdef0123', '2 of 3 as expected', 'below 1 m/s and 30 deg', '&lt;b&gt;',
                  'bag_of_moving',
                  'beetle_omni report runs_out/faults/bags/BAG'):
         assert text in html, text
-    assert all(f'<li>{name}: ' in html for name in page.OUTCOMES) and 'http' not in html
+    assert all(f'<li>{name}: ' in html for name in command.OUTCOMES) and 'http' not in html
 
 
 def test_the_command_writes_its_files_and_a_campaign_continues(tmp_path, monkeypatch):

@@ -8,8 +8,8 @@ import pytest
 from beetle_omni_ros.bags.log import Recorder
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.control.hover import HoverController
+from beetle_omni_ros.flight.component import component_class, made, node_name
 from beetle_omni_ros.flight.loop import FlightLoop
-from beetle_omni_ros.flight.plugin import component_class, made, node_name
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 

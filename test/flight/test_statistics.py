@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from beetle_omni_ros.flight.statistics import compared, described
+from beetle_omni_ros.flight.summary import compared, described
 
 
 def sampled(values):

@@ -9,9 +9,8 @@ from rich.console import Console
 
 from beetle_omni_ros.flight import campaign
 from beetle_omni_ros.flight import compare as command
-from beetle_omni_ros.flight import compared_flights as flights_module
 from beetle_omni_ros.flight.campaign import Store
-from beetle_omni_ros.flight.compared_flights import Flight, fly_flight, plan
+from beetle_omni_ros.flight.compare import Flight, fly_flight, plan
 from beetle_omni_ros.model.schema import RunError
 
 HAS_RAY = importlib.util.find_spec('ray') is not None
@@ -53,7 +52,7 @@ def test_workers_give_the_numbers_of_this_process_and_are_flown_once(poses, tmp_
     with pytest.raises(KeyboardInterrupt):
         sweep(flights, store=store, jobs=1, line=interrupt)
     assert lines == [(3, True), (4, False)]
-    monkeypatch.setattr(flights_module, 'fly', None)    # all are kept
+    monkeypatch.setattr(command, 'fly', None)    # all are kept
     both = sweep(flights, store=store, jobs=1)
     assert without_times(first[0]) == without_times(both[0])
     assert both[1]['metrics']['poses'] and not both[1]['failure']
@@ -94,8 +93,8 @@ def test_a_failed_flight_is_a_result_with_its_reason_and_not_stored(poses, tmp_p
             raise ZeroDivisionError('no way\nout')
         return real(controller, *arguments, **options)
 
-    real = flights_module.fly
-    monkeypatch.setattr(flights_module, 'fly', fly)
+    real = command.fly
+    monkeypatch.setattr(command, 'fly', fly)
     results = command.run_compare(
         output=tmp_path / 'out', controllers=['nmpc', 'hover'], tasks=[poses],
         conditions=['nominal'], seeds=[0], jobs=1, console=Console(file=io.StringIO()))

@@ -19,7 +19,7 @@ from beetle_omni_ros.bags.log import LogRecorder
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.loop import ARMING_TIME, FlightLoop
-from beetle_omni_ros.flight.reference import Reference
+from beetle_omni_ros.flight.surroundings import Reference
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.ros.graph import COMPOSED, in_simulated_time
 from beetle_omni_ros.ros.operator import Operator
