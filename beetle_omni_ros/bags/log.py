@@ -192,6 +192,8 @@ class FlightLog:
 class Recorder:
     """Interface of recorders; by itself it passes everything on to others."""
 
+    _others: tuple[Recorder, ...] = ()
+
     def __init__(self, *others: Recorder):
         self._others = others
 
@@ -213,6 +215,11 @@ class Recorder:
         """Add metadata of the flight: task, conditions, seed, robot, version."""
         for other in self._others:
             other.write_meta(meta)
+
+    def close(self) -> None:
+        """End the recording."""
+        for other in self._others:
+            other.close()
 
 
 class LogRecorder(Recorder):

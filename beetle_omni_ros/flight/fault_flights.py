@@ -7,20 +7,18 @@ A flight is judged from the true motion and the commanded thrust alone.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from time import time
 from zlib import crc32
 
 import numpy as np
 
-from beetle_omni_ros.bags.bag_writer import BagWriter
-from beetle_omni_ros.bags.log import Recorder
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.control.tasks import random_poses
 from beetle_omni_ros.flight.campaign import flight_key
+from beetle_omni_ros.flight.evaluate import prepared
 from beetle_omni_ros.flight.loop import collector_off, FlightLoop
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.mode import DISARMED, FALLBACK, FLYING, MOTORS_OFF
@@ -122,20 +120,30 @@ def fly_trial(trial: Trial, case: Case, bags: Path | None = None, plan: Plan = P
     result = {**asdict(trial), 'good': False, 'bag': trial.name if bags else '', 'error': '',
               'flown_s': 0.0}
     try:
-        with collector_off(), ExitStack() as stack:
-            recorder = stack.enter_context(BagWriter(
-                bags / trial.name, asdict(trial))) if bags else Recorder()
-            result.update(_fly_healthy(trial, recorder, plan) if case == HEALTHY
-                          else _fly_fault(trial, case, recorder, plan))
+        with collector_off(), closing(_loop(trial, case, bags)) as loop:
+            flight = Flight(loop, trial, plan)
+            result.update(_fly_healthy(flight) if case == HEALTHY else _fly_fault(flight, case))
     except Exception as error:          # the campaign continues and reports the error
         text = f'{type(error).__name__}: {error}'[:200]
         result.update(outcome='error', error=text, failure=text)
     return result
 
 
-def _fly_fault(trial, case, recorder, plan):
+def _loop(trial, case, bags):
+    """Return the robot and its flight stack on the ground."""
+    nominal = RobotParameters.load()
+    true = RobotParameters.load(trial.plant) if trial.plant else nominal
+    conditions = trial.conditions
+    if conditions == 'effects':
+        true, conditions = replace(true, effects=true.effects | EFFECTS), 'nominal'
+    return prepared(trial.controller, robot=nominal, plant=true, conditions=conditions,
+                    seed=trial.seed, pilot=True, faults=case.strike, meta=asdict(trial),
+                    bag=bags / trial.name if bags else None)
+
+
+def _fly_fault(flight, case):
     """Fly to the start, start the fault, fly on with it unless it is a landing, and land."""
-    flight = Flight(trial, case, plan, recorder)
+    trial, plan = flight.trial, flight.plan
     left, moving = plan.watch_time, trial.start in ('moving', 'random')
     part = flight.random.uniform()
     if moving:
@@ -183,10 +191,9 @@ def attitude(seed: int) -> np.ndarray:
     return rpy
 
 
-def _fly_healthy(trial, recorder, plan):
+def _fly_healthy(flight):
     """Fly random poses and land."""
-    flight = Flight(trial, HEALTHY, plan, recorder)
-    simulator, supervisor = flight.simulator, flight.supervisor
+    simulator, supervisor, plan = flight.simulator, flight.supervisor, flight.plan
     start = simulator.time
     while simulator.time - start < plan.healthy_time and supervisor.state in AIRBORNE:
         if simulator.battery.charge < FRESH:
@@ -204,24 +211,15 @@ def _fly_healthy(trial, recorder, plan):
 
 
 class Flight:
-    """One robot with its flight stack, in the air; ``loop.start_faults`` starts its faults."""
+    """A robot with its flight stack, in the air, and its moves."""
 
-    def __init__(self, trial: Trial, case: Case, plan: Plan, recorder: Recorder):
-        nominal = RobotParameters.load()
-        aboard = {entry.name: entry.make(nominal) for entry in map(
-            registry.find, dict.fromkeys([trial.controller, registry.pilot()]))}
-        true = RobotParameters.load(trial.plant) if trial.plant else nominal
-        conditions = trial.conditions
-        if conditions == 'effects':
-            true, conditions = replace(true, effects=true.effects | EFFECTS), 'nominal'
-        self.plan = plan
-        self.loop = FlightLoop(nominal, true, aboard, recorder, conditions=conditions,
-                               seed=trial.seed, faults=case.strike, epoch=int(time()))
-        self.simulator, self.supervisor = self.loop.simulator, self.loop.supervisor
+    def __init__(self, loop: FlightLoop, trial: Trial, plan: Plan):
+        self.loop, self.trial, self.plan = loop, trial, plan
+        self.simulator, self.supervisor = loop.simulator, loop.supervisor
         # With other moves for each fault, a seed is not one move.
         self.random = np.random.default_rng(
             [trial.seed, crc32(trial.case.encode())] if trial.start else trial.seed)
-        self.loop.take_off()
+        loop.take_off()
 
     def aim(self, position, rpy) -> None:
         """Set the target pose: (3,) in world [m], roll, pitch and yaw [rad]."""

@@ -317,7 +317,8 @@ class FlightLoop(Loop):
                     raise RunError(answer.text)
 
     def close(self) -> None:
-        """Release what the flight used."""
+        """End the recording."""
+        self._recorder.close()
 
     def request(self, name: str):
         """Call a service of the supervisor; returns its answer."""
