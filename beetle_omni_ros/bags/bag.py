@@ -2,11 +2,10 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import islice
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import NamedTuple
 
 from mcap.exceptions import InvalidMagic
@@ -14,14 +13,7 @@ from mcap.reader import NonSeekingReader
 import numpy as np
 
 from beetle_omni_ros.bags.conversions import from_nanoseconds
-from beetle_omni_ros.bags.log import (
-    channels_of,
-    FlightLog,
-    LogRecorder,
-    META_KEY,
-    motion,
-    stacked,
-)
+from beetle_omni_ros.bags.log import FlightLog, LogRecorder, META_KEY, motion
 from beetle_omni_ros.bags.messages import from_bytes
 from beetle_omni_ros.bags.topics import ALL, controller_of, TELLING, Topic, topic_of, TOPICS
 from beetle_omni_ros.control.base import TrajectoryTarget
@@ -174,16 +166,8 @@ def read_together(path: str | Path, warnings: list[str] | None = None
                for (topic, kind), (data, times) in groups.items()]
 
 
-def read_all(topic: Topic, messages: Sequence[bytes | memoryview]) -> tuple[
-        np.ndarray, SimpleNamespace, Counter]:
-    """
-    Read the messages of a topic whose values have numbers, arrays or None as fields.
-
-    Returns:
-        (M,) ascending indices of the readable messages; the values :func:`.log.stacked`; reason
-        -> number of refused messages.
-
-    """
+def read_all(topic: Topic, messages: Sequence[bytes]) -> tuple[list[int], list, Counter]:
+    """Return indices and values of the readable messages, and reason -> number of the others."""
     rows, values, refused = [], [], Counter()
     for row, data in enumerate(messages):
         try:
@@ -191,8 +175,7 @@ def read_all(topic: Topic, messages: Sequence[bytes | memoryview]) -> tuple[
             rows.append(row)
         except Exception as error:      # broken bytes raise anything
             refused[str(error) or type(error).__name__] += 1
-    names = [entry.name for entry in fields(topic.value) if entry.name != 'names']
-    return np.array(rows, dtype=int), stacked(values, names), refused
+    return rows, values, refused
 
 
 def read_bag(path: str | Path) -> FlightLog:
@@ -256,25 +239,16 @@ class _Reading:
         topic = topic_of(name)
         if messages.type != topic.type:
             self._refuse(name, f'type is {messages.type}, not {topic.type}', len(messages.data))
-        elif channels_of(name):
-            rows, value, refused = read_all(topic, messages.data)
-            if len(rows):
-                received = messages.received[rows]
-                value.stamp = np.where(value.stamp == 0, received, value.stamp)
-                self.recorder.write(name, value, received)
+        else:
+            rows, values, refused = read_all(topic, messages.data)
+            for row, value in zip(rows, values, strict=True):
+                received = float(messages.received[row])
+                self.recorder.write(name, _stamped(value, received), received)
             self._counts[name] += len(rows)
             for reason, number in refused.items():
                 self._refuse(name, reason, number)
-        else:
-            for data, received in zip(messages.data, messages.received.tolist(), strict=True):
-                try:
-                    value = topic.read(from_bytes(data, topic.type))
-                    self.recorder.write(name, _stamped(value, received), received)
-                    self._counts[name] += 1
-                except Exception as error:  # must not prevent reading the others
-                    self._refuse(name, str(error) or type(error).__name__)
 
-    def _refuse(self, name, reason, count=1):
+    def _refuse(self, name, reason, count):
         self._bad[name] += count
         self._reason.setdefault(name, reason)
 

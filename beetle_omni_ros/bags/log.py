@@ -9,7 +9,6 @@ Times are float seconds on the flight's clock, ROS time in the graph. A loop rec
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -236,15 +235,9 @@ class LogRecorder(Recorder):
         self._meta = dict(meta or {})
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
-        """
-        Record one value, or one whose fields are arrays over several messages.
-
-        Other topics than those of a log are ignored.
-        """
-        if (channels := channels_of(topic)) is None:
+        """Record one value; other topics than those of a log are ignored."""
+        if channels_of(topic) is None:
             self._add_event(topic, value, received)
-        elif isinstance(value.stamp, np.ndarray):
-            self._rows[topic].append(_rows(value, received, channels))
         else:
             pending = self._pending[topic]
             pending.append((value, value.stamp if received is None else received))
@@ -254,9 +247,11 @@ class LogRecorder(Recorder):
     def _add_rows(self, topic):
         """Convert the pending values of a topic together, which is faster."""
         values, received = zip(*self._pending.pop(topic), strict=True)
-        channels = channels_of(topic)
-        self._rows[topic].append(_rows(
-            stacked(values, {'stamp', *channels} - {'received'}), received, channels))
+        columns = [[value.stamp for value in values]]
+        for name, width in channels_of(topic).items():
+            parts = received if name == 'received' else [getattr(value, name) for value in values]
+            columns.append([[np.nan] * width if part is None else part for part in parts])
+        self._rows[topic].append(np.column_stack(columns).astype(float))
 
     def _add_event(self, topic, value, received):
         """Add a target, a state of the supervisor or diagnostics."""
@@ -300,25 +295,6 @@ class LogRecorder(Recorder):
 def channels_of(topic: str) -> dict[str, int] | None:
     """Return the channels of the series of a topic; None for events."""
     return CHANNELS.get(topic) or (_COMMAND if topic.endswith('/command') else None)
-
-
-def stacked(values: Sequence[Any], names: Iterable[str]) -> SimpleNamespace:
-    """Return one object for N values: each name an array with N rows, NaN for None; or None."""
-    columns: dict[str, np.ndarray | None] = {}
-    for name in names:
-        parts = [getattr(value, name) for value in values]
-        known = next((part for part in parts if part is not None), None)
-        columns[name] = None if known is None and values else np.array(
-            [np.full(np.shape(known), np.nan) if part is None else part for part in parts])
-    return SimpleNamespace(**columns)
-
-
-def _rows(value, received, channels):
-    """Return (N, W) rows of stamp and channels of a value whose fields are arrays."""
-    parts = [received if name == 'received' else getattr(value, name) for name in channels]
-    return np.column_stack([value.stamp, *(
-        np.full((len(value.stamp), width), np.nan) if part is None else part
-        for part, width in zip(parts, channels.values(), strict=True))]).astype(float)
 
 
 def _series(rows, channels):

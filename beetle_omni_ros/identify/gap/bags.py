@@ -73,11 +73,10 @@ def read_recording(path: str | Path) -> Recording:
                 _note(states, messages)
     times, values, received = {}, {}, {}
     for name, width in {**NEEDED, **OPTIONAL}.items():
-        rows, value, refused = read_all(TOPICS[name], data[name])
-        parts = () if value is None else [getattr(value, part) for part in PARTS[name]]
-        times[name] = np.zeros(0) if value is None else value.stamp
-        values[name] = np.column_stack([np.zeros((len(rows), 0)), *parts]) if len(rows) \
-            else np.zeros((0, width))
+        rows, read, refused = read_all(TOPICS[name], data[name])
+        times[name] = np.array([value.stamp for value in read], dtype=float)
+        values[name] = np.column_stack([[getattr(value, part) for value in read]
+                                        for part in PARTS[name]]) if read else np.zeros((0, width))
         received[name] = np.concatenate([np.zeros(0), *when[name]])[rows]
         if refused:
             bad[name] = bad.get(name, 0) + refused.total()
