@@ -17,7 +17,7 @@ from beetle_omni_ros.bags.log import (
     inside,
     motion,
 )
-from beetle_omni_ros.bags.task_metrics import KINDS, L_WINDOW, reduced, rms, U_WINDOW
+from beetle_omni_ros.bags.task_metrics import KINDS, L_WINDOW, reduced, U_WINDOW
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.control.tasks import GROUND_HEIGHT, make_task, POSE_DURATION, Task
 from beetle_omni_ros.model import rotations
@@ -160,7 +160,7 @@ def _controller_metrics(log, task, name, poses, intervals, *, is_alone):
     if np.any(used := inside(t, intervals)):
         result['estimation'] = {
             f'{name}_{what}_{unit}': reduced(reduce, values[used])
-            for what, reduce in (('rms', rms), ('max', np.max))
+            for what, reduce in (('rms', _rms), ('max', np.max))
             for name, unit, values in (('position', 'm', distance), ('orientation', 'deg', angle))}
     if task and log.targets and task.kind in KINDS:
         result[task.kind] = KINDS[task.kind](log, body, task, log.targets[0].stamp)
@@ -224,6 +224,10 @@ def _numbers(target, task):
     return [float(v) for v in (*target.position, *np.degrees(rotations.to_rpy(target.quaternion)))]
 
 
+def _rms(values):
+    return np.sqrt(np.mean(values ** 2))
+
+
 def failed(result: dict) -> str:
     """Why a flight failed by its results, or ''; tasks that end with lost control may crash."""
     if not {'force', 'torque'} & result.keys():
@@ -275,8 +279,8 @@ def _effort(log, body, intervals, windows):
             'thrust_mean_N': reduced(np.mean, used), 'thrust_std_N': reduced(np.std, used),
             'thrust_hover_mean_N': reduced(np.mean, thrust[inside(stamps, windows)]),
             'thrust_max_N': reduced(np.max, used),
-            'hover_command_changerms': {'joint_rad': reduced(rms, change[:, :4]),
-                                         'thrust_N': reduced(rms, change[:, 4:])},
+            'hover_command_change_rms': {'joint_rad': reduced(_rms, change[:, :4]),
+                                         'thrust_N': reduced(_rms, change[:, 4:])},
             'hover_speed_mean_m_s': reduced(np.mean, speed),
             'hover_speed_std_m_s': reduced(np.std, speed),
             'hover_angular_speed_mean_rad_s': reduced(np.mean, rate),

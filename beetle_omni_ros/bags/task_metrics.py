@@ -28,10 +28,6 @@ def reduced(reduce, values):
     return float(reduce(values)) if values.size else None
 
 
-def rms(values):
-    return np.sqrt(np.mean(values ** 2))
-
-
 def _summary(body, target, begin, end):
     """Mean, std, min, max of both errors in a window; None without samples."""
     both = errors(body, target, body.window(begin, end))
