@@ -244,12 +244,12 @@ class Component:
         if not entry.stamped:
             entry.handle(value)
             return
-        host, limit = self.host, entry.max_age
+        host = self.host
         age = host.now() - value.stamp
         try:
-            if self._identity and topic == 'command':
+            if topic == 'command':
                 self._check_source(source)
-            if limit is not None and not -FUTURE <= age <= limit:
+            if (limit := entry.max_age) is not None and not -FUTURE <= age <= limit:
                 raise MessageError('stale stamp' if age > 0 else 'stamp in the future')
             if published is None:
                 entry.handle(value)
@@ -285,7 +285,7 @@ class Component:
         those with the newest identity.
         """
         identity = self._identity
-        if source != identity:
+        if identity and source != identity:
             name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'
             raise MessageError(
                 f"2nd publisher: frame_id has {name}, expected '{identity[:TEXT_LIMIT]}'",

@@ -184,11 +184,13 @@ class Loop:
         while queue:
             topic, value, source = queue.popleft()
             write(topic, value, self._now)
+            published = None
             if topic in LATCHED_TOPICS:
                 self._latched[topic] = value
-            published = math.nan if topic in TARGETS else None
-            for component in self._readers.get(topic, ()):
-                if component in waiting:
+                if topic in TARGETS:
+                    published = math.nan
+            for component in self._readers[topic]:
+                if waiting and component in waiting:
                     waiting[component][topic].append((value, source, published))
                 else:
                     component.feed(topic, value, source, published)

@@ -1,14 +1,13 @@
 """What surrounds the flight stack as components: the simulated robot, the source of targets."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from math import degrees
 
 import numpy as np
 
 from beetle_omni_ros.bags.messages import MessageError, Wrench
 from beetle_omni_ros.bags.topics import SENSOR
-from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
+from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.tasks import Task, TaskPlayer, WITH_WRENCHES
 from beetle_omni_ros.flight.component import COMMAND_AGE, Component, Distribution, ERROR, OK, WARN
 from beetle_omni_ros.model.mode import FLYING, LANDING
@@ -84,7 +83,8 @@ class SimulatedRobot(Component):
         """Let the actuators follow a command."""
         self._latency.add(self.host.now() - command.stamp)
         self.on_answer('command', command.stamp)
-        self.simulator.command(replace(command, stamp=command.stamp - self.simulator.epoch))
+        self.simulator.command(Command(command.stamp - self.simulator.epoch, command.tilt,
+                                       command.thrust))
 
     def _on_disturbance(self, wrench):
         size, most = np.linalg.norm([wrench.force, wrench.torque], axis=1), self._most_wrench
@@ -186,7 +186,7 @@ class Reference(Component):
             self._player = self._trajectory = None
             self.update(STATE, f'{DONE}{lost}')
         else:
-            count = len(self._task.ends)
+            count = len(self._task.segments)
             self.update(STATE, f'flying {min(player.index + 1, count)}/{count}')
 
     def _publish_window(self, now):
