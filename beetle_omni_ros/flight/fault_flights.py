@@ -6,7 +6,6 @@ A flight is judged from the true motion and the commanded thrust alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,12 +14,10 @@ from zlib import crc32
 import numpy as np
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.control.tasks import random_poses
+from beetle_omni_ros.control.tasks import pose_target, random_poses
 from beetle_omni_ros.flight.campaign import flight_key
 from beetle_omni_ros.flight.evaluate import prepared
 from beetle_omni_ros.flight.loop import collector_off, FlightLoop
-from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.mode import DISARMED, FALLBACK, FLYING, MOTORS_OFF
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.sim.fault_lists import Case
@@ -121,8 +118,12 @@ def fly_trial(trial: Trial, case: Case, bags: Path | None = None, plan: Plan = P
               'flown_s': 0.0}
     try:
         with collector_off(), closing(_loop(trial, case, bags)) as loop:
-            flight = Flight(loop, trial, plan)
-            result.update(_fly_healthy(flight) if case == HEALTHY else _fly_fault(flight, case))
+            loop.take_off()
+            # With other moves for each fault, a seed is not one move.
+            moves = np.random.default_rng(
+                [trial.seed, crc32(trial.case.encode())] if trial.start else trial.seed)
+            result.update(_fly_healthy(loop, moves, plan) if case == HEALTHY
+                          else _fly_fault(loop, moves, trial, case, plan))
     except Exception as error:          # the campaign continues and reports the error
         text = f'{type(error).__name__}: {error}'[:200]
         result.update(outcome='error', error=text, failure=text)
@@ -141,46 +142,51 @@ def _loop(trial, case, bags):
                     bag=bags / trial.name if bags else None)
 
 
-def _fly_fault(flight, case):
+def _fly_fault(loop, moves, trial, case, plan):
     """Fly to the start, start the fault, fly on with it unless it is a landing, and land."""
-    trial, plan = flight.trial, flight.plan
+    simulator = loop.simulator
     left, moving = plan.watch_time, trial.start in ('moving', 'random')
-    part = flight.random.uniform()
+    part = moves.uniform()
     if moving:
         pose_time, later = (plan.pose_time, plan.pose_time) if trial.start == 'random' \
             else (plan.move_time, plan.jitter)
-        flight.aim_randomly()
-        flight.fly(pose_time)
-        flight.aim_randomly()
-        flight.fly(part * later)
+        _aim(loop, *random_poses(1, moves))
+        loop.run(pose_time)
+        _aim(loop, *random_poses(1, moves))
+        loop.run(part * later)
     elif trial.start:
         upside_down = trial.start == 'upside_down'
-        flight.aim((0.0, 0.0, plan.height), (np.pi if upside_down else 0.0, 0, 0))
-        flight.fly((plan.turn_time if upside_down else plan.hover_time) + plan.jitter * part)
+        _aim(loop, [0, 0, plan.height, 180.0 * upside_down, 0, 0])
+        loop.run((plan.turn_time if upside_down else plan.hover_time) + plan.jitter * part)
     else:
-        flight.aim((0.0, 0.0, plan.height), attitude(trial.seed))
-        flight.fly(plan.turn_time)
+        _aim(loop, [0, 0, plan.height, *np.degrees(attitude(trial.seed))])
+        loop.run(plan.turn_time)
         left = 0.0
-    watcher = Watcher(flight)
-    start = flight.simulator.time
-    flight.loop.start_faults()
+    watcher = Watcher(loop, plan)
+    start = simulator.time
+    loop.start_faults()
     over = False
     while left > 0 and not over:
         period = min(left, plan.move_time) if moving else left
-        over = flight.fly(period, watcher)
+        over = loop.run(period, watcher)
         left -= period
         if left > 0 and not over:
-            flight.aim_randomly()
-    asked = flight.supervisor.state in AIRBORNE
+            _aim(loop, *random_poses(1, moves))
+    asked = loop.supervisor.state in AIRBORNE
     if not over:
-        flight.land(watcher)
+        loop.request('land')
+        loop.run(plan.landing_time, watcher)
     seen = watcher.observed(asked=asked)
     good = seen['outcome'] in BETTER[case.expected]
     if good and not trial.start:
         good = bool(seen['impact_m_s'] <= plan.landing_speed
                     and np.radians(seen['inclination_deg']) <= plan.landing_inclination)
-    return {**seen, 'expected': case.expected, 'flown_s': flight.simulator.time - start,
-            'good': good}
+    return {**seen, 'expected': case.expected, 'flown_s': simulator.time - start, 'good': good}
+
+
+def _aim(loop, pose):
+    """Set a target: x, y, z in world [m], roll, pitch, yaw [deg]."""
+    loop.aim(pose_target(np.array(pose, dtype=float), loop.now()))
 
 
 def attitude(seed: int) -> np.ndarray:
@@ -191,72 +197,36 @@ def attitude(seed: int) -> np.ndarray:
     return rpy
 
 
-def _fly_healthy(flight):
+def _fly_healthy(loop, moves, plan):
     """Fly random poses and land."""
-    simulator, supervisor, plan = flight.simulator, flight.supervisor, flight.plan
+    simulator, supervisor = loop.simulator, loop.supervisor
     start = simulator.time
     while simulator.time - start < plan.healthy_time and supervisor.state in AIRBORNE:
         if simulator.battery.charge < FRESH:
             simulator.battery.reset()
-        flight.aim_randomly()
-        flight.fly(plan.pose_time)
-    flight.land(lambda: supervisor.state == DISARMED)
-    epoch = flight.loop.epoch
-    alarms = [[event.stamp - epoch, event.severity, event.text] for event in flight.loop.events
+        _aim(loop, *random_poses(1, moves))
+        loop.run(plan.pose_time)
+    loop.request('land')
+    loop.run(plan.landing_time, lambda: supervisor.state == DISARMED)
+    alarms = [[event.stamp - loop.epoch, event.severity, event.text] for event in loop.events
               if event.severity != INFO]
-    alarms += [[stamp - epoch, 'fault', name] for name, stamp in supervisor.faults.items()]
+    alarms += [[stamp - loop.epoch, 'fault', name] for name, stamp in supervisor.faults.items()]
     landed = supervisor.state == DISARMED
     return {'flown_s': simulator.time - start, 'state': supervisor.state, 'alarms': alarms,
             'outcome': 'flies_on' if landed else 'does not land', 'good': landed and not alarms}
 
 
-class Flight:
-    """A robot with its flight stack, in the air, and its moves."""
-
-    def __init__(self, loop: FlightLoop, trial: Trial, plan: Plan):
-        self.loop, self.trial, self.plan = loop, trial, plan
-        self.simulator, self.supervisor = loop.simulator, loop.supervisor
-        # With other moves for each fault, a seed is not one move.
-        self.random = np.random.default_rng(
-            [trial.seed, crc32(trial.case.encode())] if trial.start else trial.seed)
-        loop.take_off()
-
-    def aim(self, position, rpy) -> None:
-        """Set the target pose: (3,) in world [m], roll, pitch and yaw [rad]."""
-        self.loop.aim(PoseTarget(np.array(position, dtype=float), rotations.from_rpy(*rpy),
-                                 self.loop.now()))
-
-    def aim_randomly(self) -> None:
-        """Set a random target pose, as of random100."""
-        pose = random_poses(1, self.random)[0]
-        self.aim(pose[:3], np.radians(pose[3:]))
-
-    def fly(self, duration: float, over: Callable[[], bool] = lambda: False) -> bool:
-        """Fly for ``duration`` [s] or until ``over`` is true; returns whether it became true."""
-        end = self.simulator.time + duration
-        while self.simulator.time < end:
-            self.loop.step()
-            if over():
-                return True
-        return False
-
-    def land(self, over: Callable[[], bool]) -> None:
-        """Request a landing and fly on."""
-        self.loop.request('land')
-        self.fly(self.plan.landing_time, over)
-
-
 class Watcher:
     """Follows a flight from the onset of its fault; a call returns whether the flight is over."""
 
-    def __init__(self, flight: Flight):
+    def __init__(self, loop: FlightLoop, plan: Plan):
         """Start now."""
         own = SupervisorParameters.load()
-        self._flight, self._plan = flight, flight.plan
+        self._loop, self._plan = loop, plan
         self._fence = np.array([own.fence_half_width, own.fence_half_width, own.fence_height])
-        self._place, self._start = flight.simulator.truth.position.copy(), flight.simulator.time
-        self._past_events = len(flight.loop.events)
-        self._past_faults = set(flight.supervisor.faults)
+        self._place, self._start = loop.simulator.truth.position.copy(), loop.simulator.time
+        self._past_events = len(loop.events)
+        self._past_faults = set(loop.supervisor.faults)
         self._still = self._down = 0.0
         self._floor: float | None = None
         self.impacts: list[Impact] = []             # touchdowns
@@ -269,10 +239,10 @@ class Watcher:
 
     def __call__(self) -> bool:
         """Observe the last tick; returns whether the flight is over."""
-        simulator, supervisor = self._flight.simulator, self._flight.supervisor
+        simulator, supervisor = self._loop.simulator, self._loop.supervisor
         truth, tick = simulator.truth, simulator.tick
         self.step(truth, float(simulator.link.thrust.sum()), tick)
-        self.said = self.said or next((event.text for event in self._flight.loop.events[
+        self.said = self.said or next((event.text for event in self._loop.events[
             self._past_events:] if event.severity != INFO), '')
         if not self.named[0]:
             self.named = next(((name, simulator.time - self._start) for name in supervisor.faults
@@ -309,11 +279,11 @@ class Watcher:
             'inclination_deg': None if inclined is None else float(np.degrees(inclined)),
             'overrun_s': self.overrun, 'flyaway': self.flyaway, 'takeoffs': self.takeoffs,
             'named': self.named[0], 'named_s': self.named[1], 'said': self.said,
-            'state': self._flight.supervisor.state}
+            'state': self._loop.supervisor.state}
 
     def outcome(self, asked: bool) -> str:
         """Outcome of the flight as one word of :data:`.page.OUTCOMES`."""
-        stopped = self._flight.supervisor.state in MOTORS_OFF
+        stopped = self._loop.supervisor.state in MOTORS_OFF
         if self.flyaway:
             return 'flyaway'
         if self.takeoffs:
@@ -329,4 +299,4 @@ class Watcher:
             return 'tilted'
         if not asked:
             return 'lands'
-        return 'refused' if self._flight.loop.refusals else 'flies_on'
+        return 'refused' if self._loop.refusals else 'flies_on'

@@ -318,6 +318,15 @@ class FlightLoop(Loop):
                 if not answer:
                     raise RunError(answer.text)
 
+    def run(self, duration: float, over: Callable[[], bool] = lambda: False) -> bool:
+        """Step for ``duration`` [s] or until ``over`` is true; return whether it became true."""
+        end = self.simulator.time + duration
+        while self.simulator.time < end:
+            self.step()
+            if over():
+                return True
+        return False
+
     def close(self) -> None:
         """End the recording."""
         self._recorder.close()

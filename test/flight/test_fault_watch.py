@@ -19,9 +19,8 @@ def truth(t, height=1.0, x=0.0, contact=False, impact=None, broken=False):
 @pytest.fixture
 def watch():
     return Watcher(SimpleNamespace(
-        plan=PLAN, simulator=SimpleNamespace(truth=truth(0.0, 0.0), time=0.0),
-        supervisor=SimpleNamespace(faults={}, state='disarmed'),
-        loop=SimpleNamespace(refusals=[], events=[])))
+        simulator=SimpleNamespace(truth=truth(0.0, 0.0), time=0.0), refusals=[], events=[],
+        supervisor=SimpleNamespace(faults={}, state='disarmed')), PLAN)
 
 
 def soft(t=1.0, speed=0.3, inclination=0.05):
@@ -29,7 +28,7 @@ def soft(t=1.0, speed=0.3, inclination=0.05):
 
 
 def judged(watch, asked=True, state='disarmed', refusals=()):
-    watch._flight.supervisor.state, watch._flight.loop.refusals = state, refusals
+    watch._loop.supervisor.state, watch._loop.refusals = state, refusals
     return watch.outcome(asked)
 
 

@@ -36,9 +36,7 @@ def test_an_observer_of_others_estimates_an_external_force_in_the_loop():
     loop.take_off()
     loop.aim(PoseTarget(np.array([0.0, 0.0, 1.0]), np.array([0, 0, 0, 1.0]), loop.now()))
     loop.simulator.wrench = np.array([3.0, -2.0, 4.0, 0, 0, 0])
-    end = loop.simulator.time + 2.0
-    while loop.simulator.time < end:
-        loop.step()
+    loop.run(2.0)
     assert np.allclose(np.mean(forces.values[-200:], axis=0), [3.0, -2.0, 4.0], atol=0.5)
 
 

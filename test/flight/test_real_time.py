@@ -26,9 +26,7 @@ def test_a_flight_through_drivers_and_emulated_devices_holds_its_target():
     with closing(EmulatedLoop(ROBOT, ROBOT, {'hover': HoverController(ROBOT)}, recorder)) as loop:
         loop.take_off()
         loop.aim(PoseTarget(np.array([0.0, 0.0, 1.0]), np.array([0, 0, 0, 1.0]), loop.now()))
-        end = loop.simulator.time + 2.0
-        while loop.simulator.time < end:
-            loop.step()
+        loop.run(2.0)
         truth = loop.simulator.truth
         # a stall of the computer leads to the fallback, which is the same controller
         assert loop.supervisor.state in ('flying', 'fallback')
