@@ -192,14 +192,41 @@ def read_bag(path: str | Path) -> FlightLog:
         ParameterError: no such bag, unreadable, not MCAP, or several robots in it.
 
     """
-    reading, warnings = _Reading(), []
+    recorder, warnings = LogRecorder(), []
+    counts: Counter = Counter()
+    unused: dict[str, Counter] = {}     # topic -> reason -> number of messages
     for together in read_together(path, warnings):
         for messages in together:
-            reading.take(messages)
-    reading.recorder.write_meta(_metadata(path, warnings))
-    log = reading.recorder.log()
-    log.warnings, log.source = warnings + reading.problems(), str(path)
+            name = messages.topic
+            if name not in ALL and not controller_of(name):
+                continue
+            topic, refused = topic_of(name), unused.setdefault(name, Counter())
+            if messages.type != topic.type:
+                refused[f'type is {messages.type}, not {topic.type}'] += len(messages.data)
+                continue
+            rows, values, reasons = read_all(topic, messages.data)
+            refused.update(reasons)
+            for row, value in zip(rows, values, strict=True):
+                received = float(messages.received[row])
+                try:
+                    recorder.write(name, _stamped(value, received), received)
+                    counts[name] += 1
+                except ValueError as error:     # a number in the text of a diagnostic value
+                    refused[str(error)] += 1
+    recorder.write_meta(_metadata(path, warnings))
+    log = recorder.log()
+    log.warnings, log.source = warnings + _problems(counts, unused), str(path)
     return log
+
+
+def _problems(counts, unused):
+    """Return a line about missing topics, and one for each topic with unusable messages."""
+    missing = [name for name, topic in TOPICS.items() if topic.required and not counts[name]]
+    if 'target_pose' in missing and counts['target_trajectory']:
+        missing.remove('target_pose')
+    lines = [f"no message on {', '.join(missing)}"] if missing else []
+    return lines + [f'{name}: {refused.total()} messages not used ({next(iter(refused))})'
+                    for name, refused in unused.items() if refused]
 
 
 def read_flights(paths: Iterable[str | Path], most: int) -> dict[str, FlightLog]:
@@ -220,47 +247,6 @@ def read_flights(paths: Iterable[str | Path], most: int) -> dict[str, FlightLog]
             raise ParameterError('; '.join([f'{path}: no pose of the robot; expected '
                                             'ground_truth/odom or odom', *log.warnings]))
     return logs
-
-
-class _Reading:
-    """Sorts messages by topic into a log, and counts unusable ones."""
-
-    def __init__(self):
-        self.recorder = LogRecorder()
-        self._counts: Counter = Counter()
-        self._bad: Counter = Counter()
-        self._reason: dict[str, str] = {}
-
-    def take(self, messages: Recorded) -> None:
-        """Read messages of one topic; those of a series together."""
-        name = messages.topic
-        if name not in ALL and not controller_of(name):
-            return
-        topic = topic_of(name)
-        if messages.type != topic.type:
-            self._refuse(name, f'type is {messages.type}, not {topic.type}', len(messages.data))
-        else:
-            rows, values, refused = read_all(topic, messages.data)
-            for row, value in zip(rows, values, strict=True):
-                received = float(messages.received[row])
-                self.recorder.write(name, _stamped(value, received), received)
-            self._counts[name] += len(rows)
-            for reason, number in refused.items():
-                self._refuse(name, reason, number)
-
-    def _refuse(self, name, reason, count):
-        self._bad[name] += count
-        self._reason.setdefault(name, reason)
-
-    def problems(self) -> list[str]:
-        """Return a line about missing topics, and one for each topic with unusable messages."""
-        missing = [name for name, topic in TOPICS.items()
-                   if topic.required and not self._counts[name]]
-        if 'target_pose' in missing and self._counts['target_trajectory']:
-            missing.remove('target_pose')
-        lines = [f"no message on {', '.join(missing)}"] if missing else []
-        return lines + [f'{name}: {count} messages not used ({self._reason[name]})'
-                        for name, count in self._bad.items()]
 
 
 def _stamped(value, received):

@@ -35,44 +35,41 @@ TEXT_LIMIT = 40         # characters of a foreign identity in an error message
 
 
 class Distribution:
-    """Quantiles of durations in constant memory: a histogram with 2 % wide bins."""
+    """
+    Quantiles of durations in constant memory: a histogram with 2 % wide bins.
+
+    Attributes:
+        count: number of durations.
+        max: longest duration [s]; 0 without one.
+
+    """
 
     EDGES = 1e-6 * 1.02 ** np.arange(1000)      # [s], up to 400 s
     PENDING = 1000      # durations that wait to be counted together, which is faster
 
     def __init__(self):
+        self.count, self.max = 0, 0.0
         self._counts = np.zeros(len(self.EDGES) + 1, dtype=np.int64)
-        self._max, self._pending = 0.0, []
+        self._pending: list[float] = []
 
     def add(self, seconds: float) -> None:
         """Count one duration [s]."""
+        self.count, self.max = self.count + 1, max(self.max, seconds)
         self._pending.append(seconds)
         if len(self._pending) == self.PENDING:
-            self._count()
+            self._fill()
 
-    def _count(self):
-        if self._pending:
-            np.add.at(self._counts, np.searchsorted(self.EDGES, self._pending, 'right'), 1)
-            self._max = max(self._max, *self._pending)
-            self._pending.clear()
-
-    @property
-    def count(self) -> int:
-        """Number of durations."""
-        return int(self._counts.sum()) + len(self._pending)
-
-    @property
-    def max(self) -> float:
-        """Longest duration [s]; 0 without one."""
-        return max([self._max, *self._pending])
+    def _fill(self):
+        np.add.at(self._counts, np.searchsorted(self.EDGES, self._pending, 'right'), 1)
+        self._pending.clear()
 
     def quantile(self, fraction: float) -> float:
         """Return a quantile [s], up to 2 % too large; NaN if nothing was counted."""
-        self._count()
         if not self.count:
             return float('nan')
+        self._fill()
         k = int(np.searchsorted(np.cumsum(self._counts), fraction * self.count))
-        return float(min(self.EDGES[k] if k < len(self.EDGES) else self._max, self._max))
+        return float(min(self.EDGES[k] if k < len(self.EDGES) else self.max, self.max))
 
     def status(self, text: str, level: int = OK, **more: float) -> tuple[int, str, dict]:
         """Return median, 99th percentile, maximum [ms] and number as a diagnostic status."""

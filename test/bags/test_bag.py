@@ -140,10 +140,13 @@ def test_compute_times_come_from_the_diagnostics_of_the_nodes(tmp_path):
             write_diagnostic(writer, count, 'robot1/nmpc_node: compute', {
                 'median_ms': '0.2', 'p99_ms': '0.5', 'max_ms': count, 'deadline_misses': '1',
                 'count': count, 'wall_max_ms': 9})
+        write_diagnostic(writer, 30, 'nmpc_node: compute', dict.fromkeys(
+            ('median_ms', 'p99_ms', 'max_ms', 'deadline_misses', 'count'), 'many'))
     log = read_bag(tmp_path / 'bag')
     assert log.compute == {'nmpc': {'median': 0.2, 'p99': 0.5, 'max': 20.0,
                                     'deadline_misses': 1, 'count': 20}}
     assert len(log.compute_history['nmpc']) == 2
+    assert 'diagnostics: 1 messages not used' in log.warnings[-1]
 
 
 def test_meta_data_can_be_added_to_a_finished_bag(tmp_path):
