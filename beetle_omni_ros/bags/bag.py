@@ -111,7 +111,7 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         ParameterError: no such bag, unreadable, or not MCAP.
 
     """
-    found, broken = 0, ''
+    readable, broken = 0, ''
     for file in bag_files(path):
         count = 0
         try:
@@ -134,8 +134,8 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
                 broken = f'{file.name}: {kind} after {count} readable messages'
                 if warnings is not None:
                     warnings.append(broken)
-        found += count
-    if broken and not found:
+        readable += count
+    if broken and not readable:
         raise ParameterError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
 
 
@@ -158,8 +158,8 @@ def read_together(path: str | Path, warnings: list[str] | None = None
         spaces |= {topic.removesuffix(name).rstrip('/') for topic, _ in groups for name in TELLING
                    if topic.endswith(f'/{name}')}
         if len(spaces) > 1:
-            found = ' and '.join(f"'{space}'" for space in sorted(spaces))
-            raise ParameterError(f'{path}: holds several robots ({found}); expected one')
+            robots = ' and '.join(f"'{space}'" for space in sorted(spaces))
+            raise ParameterError(f'{path}: holds several robots ({robots}); expected one')
         begin = f"{next(iter(spaces), '')}/"
         yield [Recorded('diagnostics' if topic == '/diagnostics' else topic.removeprefix(begin),
                         kind, data, np.array(times))

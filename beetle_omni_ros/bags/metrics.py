@@ -36,14 +36,14 @@ TOUCHDOWN = 0.05  # [m] above the place where the robot lies at the end
 POSE_KEYS = ('U_position_m', 'U_orientation_deg', 'L_position_m', 'L_orientation_deg')
 
 
-def at(found, path: str):
+def at(value, path: str):
     """Return the value at a path of keys and indices such as 'mean.U_position_m', or None."""
     for key in path.split('.'):
         try:
-            found = found[int(key) if isinstance(found, list) else key]
+            value = value[int(key) if isinstance(value, list) else key]
         except (KeyError, IndexError, TypeError):
             return None
-    return found
+    return value
 
 
 def metrics(log: FlightLog, task: Task | None = None) -> dict:

@@ -50,7 +50,7 @@ TRACE_PERIOD = 0.05  # [s] between samples of a trace
 
 
 @dataclass(frozen=True, order=True)
-class Flight:
+class ComparedFlight:
     """One flight of a comparison."""
 
     task: str           # name, or path of a pose file
@@ -92,7 +92,7 @@ class Flight:
 
 def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
          conditions: Sequence[str] = CONDITIONS, seeds: Sequence[int] | None = None,
-         policy: Path | None = None, plant: Path | None = None) -> list[Flight]:
+         policy: Path | None = None, plant: Path | None = None) -> list[ComparedFlight]:
     """
     List all flights, longest first, so that none of the long ones remains at the end.
 
@@ -107,14 +107,14 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
     for task in tasks:
         duration = make_task(task).duration
         usual = range(next(count for longest, count in SEEDS.items() if duration <= longest))
-        flights += [Flight(task, condition, entry.name, seed, other.get(entry.name, ''),
+        flights += [ComparedFlight(task, condition, entry.name, seed, other.get(entry.name, ''),
                            entry.spec, str(plant or ''))
                     for condition, entry, seed in product(
                         conditions, entries, usual if seeds is None else seeds)]
     return sorted(flights, key=lambda flight: -flight.cost)
 
 
-def fly_flight(flight: Flight, task: Task) -> dict:
+def fly_flight(flight: ComparedFlight, task: Task) -> dict:
     """
     Fly a flight and compute its metrics; ``task`` was made on the computer with the pose file.
 

@@ -49,7 +49,7 @@ BETTER = {'flies_on': ('flies_on', 'refused'), 'lands': ('flies_on', 'refused', 
 
 
 @dataclass(frozen=True)
-class Plan:
+class FaultPlan:
     """Flights of the campaign, and limits of their outcomes."""
 
     height: float = 1.5             # [m] of hover and inverted hover
@@ -74,11 +74,11 @@ class Plan:
     landing_inclination: float = 0.3490659  # [rad] 20 deg, in the landing campaign
 
 
-PLAN = Plan()
+PLAN = FaultPlan()
 
 
 @dataclass(frozen=True)
-class Trial:
+class FaultFlight:
     """Parameters of a flight."""
 
     case: str                   # name of the fault in the list, or of a landing or healthy flight
@@ -100,66 +100,67 @@ class Trial:
     @property
     def key(self) -> str:
         """Digest of everything that determines its result."""
-        return flight_key(fly_trial, self.controller, self.case, self.start, str(self.seed),
+        return flight_key(fly_case, self.controller, self.case, self.start, str(self.seed),
                           self.conditions, self.listed, plant=self.plant)
 
 
-def fly_trial(trial: Trial, case: Case, bags: Path | None = None, plan: Plan = PLAN) -> dict:
+def fly_case(flight: FaultFlight, case: Case, bags: Path | None = None,
+             plan: FaultPlan = PLAN) -> dict:
     """
-    Fly one trial of a case; ``bags`` is the folder for its bag.
+    Fly one flight of a case; ``bags`` is the folder for its bag.
 
     Returns:
-        the trial's fields, flown_s, state, good, bag (its name or ''), error ('' without an
+        the flight's fields, flown_s, state, good, bag (its name or ''), error ('' without an
         exception), and the fields of :meth:`Watcher.observed` or, of a healthy flight, alarms
         (stamp, severity and text of every event above information and of every named fault).
 
     """
-    result = {**asdict(trial), 'good': False, 'bag': trial.name if bags else '', 'error': '',
+    result = {**asdict(flight), 'good': False, 'bag': flight.name if bags else '', 'error': '',
               'flown_s': 0.0}
     try:
-        with collector_off(), closing(_loop(trial, case, bags)) as loop:
+        with collector_off(), closing(_loop(flight, case, bags)) as loop:
             loop.take_off()
             # With other moves for each fault, a seed is not one move.
             moves = np.random.default_rng(
-                [trial.seed, crc32(trial.case.encode())] if trial.start else trial.seed)
+                [flight.seed, crc32(flight.case.encode())] if flight.start else flight.seed)
             result.update(_fly_healthy(loop, moves, plan) if case == HEALTHY
-                          else _fly_fault(loop, moves, trial, case, plan))
+                          else _fly_struck(loop, moves, flight, case, plan))
     except Exception as error:          # the campaign continues and reports the error
         text = f'{type(error).__name__}: {error}'[:200]
         result.update(outcome='error', error=text, failure=text)
     return result
 
 
-def _loop(trial, case, bags):
+def _loop(flight, case, bags):
     """Return the robot and its flight stack on the ground."""
     nominal = RobotParameters.load()
-    true = RobotParameters.load(trial.plant) if trial.plant else nominal
-    conditions = trial.conditions
+    true = RobotParameters.load(flight.plant) if flight.plant else nominal
+    conditions = flight.conditions
     if conditions == 'effects':
         true, conditions = replace(true, effects=true.effects | EFFECTS), 'nominal'
-    return prepared(trial.controller, robot=nominal, plant=true, conditions=conditions,
-                    seed=trial.seed, pilot=True, faults=case.strike, meta=asdict(trial),
-                    bag=bags / trial.name if bags else None)
+    return prepared(flight.controller, robot=nominal, plant=true, conditions=conditions,
+                    seed=flight.seed, pilot=True, faults=case.strike, meta=asdict(flight),
+                    bag=bags / flight.name if bags else None)
 
 
-def _fly_fault(loop, moves, trial, case, plan):
+def _fly_struck(loop, moves, flight, case, plan):
     """Fly to the start, start the fault, fly on with it unless it is a landing, and land."""
     simulator = loop.simulator
-    left, moving = plan.watch_time, trial.start in ('moving', 'random')
+    left, moving = plan.watch_time, flight.start in ('moving', 'random')
     part = moves.uniform()
     if moving:
-        pose_time, later = (plan.pose_time, plan.pose_time) if trial.start == 'random' \
+        pose_time, later = (plan.pose_time, plan.pose_time) if flight.start == 'random' \
             else (plan.move_time, plan.jitter)
         _aim(loop, *random_poses(1, moves))
         loop.run(pose_time)
         _aim(loop, *random_poses(1, moves))
         loop.run(part * later)
-    elif trial.start:
-        upside_down = trial.start == 'upside_down'
+    elif flight.start:
+        upside_down = flight.start == 'upside_down'
         _aim(loop, [0, 0, plan.height, 180.0 * upside_down, 0, 0])
         loop.run((plan.turn_time if upside_down else plan.hover_time) + plan.jitter * part)
     else:
-        _aim(loop, [0, 0, plan.height, *np.degrees(attitude(trial.seed))])
+        _aim(loop, [0, 0, plan.height, *np.degrees(attitude(flight.seed))])
         loop.run(plan.turn_time)
         left = 0.0
     watcher = Watcher(loop, plan)
@@ -178,7 +179,7 @@ def _fly_fault(loop, moves, trial, case, plan):
         loop.run(plan.landing_time, watcher)
     seen = watcher.observed(asked=asked)
     good = seen['outcome'] in BETTER[case.expected]
-    if good and not trial.start:
+    if good and not flight.start:
         good = bool(seen['impact_m_s'] <= plan.landing_speed
                     and np.radians(seen['inclination_deg']) <= plan.landing_inclination)
     return {**seen, 'expected': case.expected, 'flown_s': simulator.time - start, 'good': good}
@@ -219,7 +220,7 @@ def _fly_healthy(loop, moves, plan):
 class Watcher:
     """Follows a flight from the onset of its fault; a call returns whether the flight is over."""
 
-    def __init__(self, loop: FlightLoop, plan: Plan):
+    def __init__(self, loop: FlightLoop, plan: FaultPlan):
         """Start now."""
         own = SupervisorParameters.load()
         self._loop, self._plan = loop, plan

@@ -17,13 +17,13 @@ from beetle_omni_ros.flight.campaign import file_digest, Store, sweep
 from beetle_omni_ros.flight.fault_flights import (
     ALL_STARTS,
     CONDITIONS,
-    fly_trial,
+    FaultFlight,
+    fly_case,
     HEALTHY,
     LANDING,
     LANDING_BLIND,
     PLAN,
     STARTS,
-    Trial,
 )
 from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -205,11 +205,12 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     elif healthy:
         struck, begins, under = [HEALTHY], ('',), CONDITIONS
         count = ceil(3600 * healthy / PLAN.healthy_time)
-    calls = [(Trial(case.name, start, k, name, **common), case, output / 'bags' if bags else None)
+    folder = output / 'bags' if bags else None
+    calls = [(FaultFlight(case.name, start, k, name, **common), case, folder)
              for case in struck for start in begins for name in under
              for k in range(seed, seed + count)]
     store = Store(output / FLIGHTS) if output else None
-    flown = sweep(fly_trial, calls, store=None if bags else store, jobs=jobs,
+    flown = sweep(fly_case, calls, store=None if bags else store, jobs=jobs,
                   console=console)      # a stored flight records no bag
     results = {'meta': {
         'command': shlex.join(['beetle_omni', *sys.argv[1:]]), 'version': __version__,

@@ -292,7 +292,7 @@ def _sample(metric, by_seed):
 def printed(task: str, metric: Metric, column: str) -> dict:
     """Published mean of a metric, with std, min and max where they are printed; {} for none."""
     numbers, real = PRINTED.get(kind_of(task), ({}, False))
-    found = numbers.get(PUBLISHED[column] + ', real robot' * real, {})
+    published_numbers = numbers.get(PUBLISHED[column] + ', real robot' * real, {})
     parts = ('mean', 'std', 'min', 'max') if 'mean' in metric.printed else ('mean',)
     return {part: value for part in parts
-            if (value := at(found, metric.printed.replace('mean', part))) is not None}
+            if (value := at(published_numbers, metric.printed.replace('mean', part))) is not None}

@@ -12,7 +12,7 @@ from scipy import stats
 
 from beetle_omni_ros.flight import compare as command
 from beetle_omni_ros.flight import comparison_page as page
-from beetle_omni_ros.flight.compare import Flight
+from beetle_omni_ros.flight.compare import ComparedFlight
 from beetle_omni_ros.flight.summary import compared, described
 
 CONTROLLERS = ('rl', 'nmpc', 'nmpc_published')
@@ -101,12 +101,12 @@ def test_failed_and_crashed_flights_are_reported_and_affect_no_other(tmp_path):
     fell['metrics'].update(crashed=True, ended='emergency_stop: crash at 20.9 s')
     lost = made('force', duration=13.0)
     lost['metrics']['crashed'] = True
-    flown = {Flight('waypoints', 'nominal', 'rl', 0): FAILED,
-             Flight('waypoints', 'nominal', 'nmpc', 0): fell,
-             Flight('waypoints', 'nominal', 'nmpc_published', 0): made('waypoints'),
-             Flight('force', 'nominal', 'rl', 0): lost,
-             Flight('force', 'nominal', 'nmpc', 0): FAILED,
-             Flight('force', 'nominal', 'nmpc_published', 0): FAILED}
+    flown = {ComparedFlight('waypoints', 'nominal', 'rl', 0): FAILED,
+             ComparedFlight('waypoints', 'nominal', 'nmpc', 0): fell,
+             ComparedFlight('waypoints', 'nominal', 'nmpc_published', 0): made('waypoints'),
+             ComparedFlight('force', 'nominal', 'rl', 0): lost,
+             ComparedFlight('force', 'nominal', 'nmpc', 0): FAILED,
+             ComparedFlight('force', 'nominal', 'nmpc_published', 0): FAILED}
     html, numbers, text = written(tmp_path, flown, ('waypoints', 'force'),
                                   skipped={'rl_any': 'no such file'})
     assert 'no take-off &lt;within&gt; 30 s' in html and '<within>' not in html

@@ -14,12 +14,12 @@ from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.flight import campaign
 from beetle_omni_ros.flight import faults as command
 from beetle_omni_ros.flight.fault_flights import (
-    fly_trial,
+    FaultFlight,
+    fly_case,
     HEALTHY,
     LANDING,
     LANDING_BLIND,
     PLAN,
-    Trial,
     Watcher,
 )
 from beetle_omni_ros.sim.fault_lists import load_cases
@@ -32,7 +32,7 @@ CASES = load_cases() | {case.name: case for case in (HEALTHY, LANDING, LANDING_B
 
 
 def flown(case, start='hover', plan=QUICK, bags=None, **options):
-    return fly_trial(Trial(case, start, **options), CASES[case], bags, plan)
+    return fly_case(FaultFlight(case, start, **options), CASES[case], bags, plan)
 
 
 def test_a_trial_is_deterministic_and_its_bag_is_read_back(tmp_path):
@@ -78,7 +78,7 @@ def test_the_ground_is_detected_although_the_accelerometer_jitters_on_it():
 
 
 def result(case, **values):
-    return {**asdict(Trial(case)), 'expected': 'lands', 'outcome': 'lands', 'good': True,
+    return {**asdict(FaultFlight(case)), 'expected': 'lands', 'outcome': 'lands', 'good': True,
             'impact_m_s': 0.3, 'bag': '', 'error': '', **values}
 
 

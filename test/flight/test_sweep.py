@@ -10,7 +10,7 @@ from rich.console import Console
 from beetle_omni_ros.flight import campaign
 from beetle_omni_ros.flight import compare as command
 from beetle_omni_ros.flight.campaign import Store
-from beetle_omni_ros.flight.compare import Flight, fly_flight, plan
+from beetle_omni_ros.flight.compare import ComparedFlight, fly_flight, plan
 from beetle_omni_ros.model.schema import RunError
 
 HAS_RAY = importlib.util.find_spec('ray') is not None
@@ -71,10 +71,10 @@ def test_ray_gives_the_same_numbers_as_processes(poses):
 
 
 def test_a_stored_flight_is_reused_for_equal_inputs_only(poses, tmp_path, monkeypatch):
-    store, flight = Store(tmp_path / 'kept'), Flight(poses, 'nominal', 'hover', 0)
+    store, flight = Store(tmp_path / 'kept'), ComparedFlight(poses, 'nominal', 'hover', 0)
     store.save(flight, {'failure': None, 'metrics': {'a': list(range(999))}, 'trace': {}})
     assert store.load(flight) is not None
-    assert store.load(Flight(poses, 'nominal', 'hover', 1)) is None
+    assert store.load(ComparedFlight(poses, 'nominal', 'hover', 1)) is None
     with monkeypatch.context() as patch:
         patch.setattr(campaign, 'code_fingerprint', lambda *_: 'other code')
         assert store.load(flight) is None
