@@ -70,8 +70,7 @@ class Loop:
     """
     Host of components and a simulated robot, advanced tick by tick.
 
-    ``through`` gets (topic, value) of each published message and returns the values that arrive.
-    A recorder gets all of them. ``epoch`` is the time of the stamps at the start [s].
+    A recorder gets all messages. ``epoch`` is the time of the stamps at the start [s].
 
     Attributes:
         robot: the simulated robot.
@@ -82,13 +81,12 @@ class Loop:
     simulated = True
 
     def __init__(self, robot: SimulatedRobot, components: Sequence[Component],
-                 recorder: Recorder | None = None,
-                 through: Callable[[str, Any], list] | None = None, epoch: int = EPOCH):
+                 recorder: Recorder | None = None, epoch: int = EPOCH):
         self.robot, self.refusals = robot, []       # type: ignore[var-annotated]
         robot.simulator.epoch = epoch
         self._elapsed = robot.simulator.time
         self._now = epoch + self._elapsed
-        self._recorder, self._through = recorder or Recorder(), through
+        self._recorder = recorder or Recorder()
         self._queue: deque[tuple[str, Any, str]] = deque()
         self._readers: dict[str, list[Component]] = defaultdict(list)
         self._timers: list[tuple[Component, Timer]] = []
@@ -134,14 +132,6 @@ class Loop:
 
     def publish(self, topic: str, value: Any, source: str = '') -> None:
         """Queue a message."""
-        if self._through is None:
-            self._queue.append((topic, value, source))
-            return
-        for one in self._through(topic, value):
-            self.deliver_later(topic, one, source)
-
-    def deliver_later(self, topic: str, value: Any, source: str = '') -> None:
-        """Queue a message that has passed all faults."""
         self._queue.append((topic, value, source))
 
     def log(self, severity: str, text: str) -> None:
@@ -250,7 +240,7 @@ class FlightLoop(Loop):
         super().__init__(
             SimulatedRobot(self.simulator, plant),
             [self._estimator, *self._controllers.values(), self._supervision, *others], recorder,
-            self._through_faults if faults else None, epoch)
+            epoch)
         self.deliver()
 
     def fly(self, task: Task, progress: Callable[..., None] | None = None) -> bool:
@@ -357,8 +347,12 @@ class FlightLoop(Loop):
         self._faults.set([one for one in self._given_faults if one.is_process],
                          self.simulator.time)
 
-    def _through_faults(self, topic, value):
-        return self._faults.passed(topic, value, self.supervisor.active, self.now())
+    def publish(self, topic: str, value: Any, source: str = '') -> None:
+        """Queue a message, or what the faults of its process make of it."""
+        values = [value] if self._faults.empty else self._faults.passed(
+            topic, value, self.supervisor.active, self.now())
+        for one in values:
+            super().publish(topic, one, source)
 
     def before_messages(self) -> None:
         """Apply the faults of processes that begin, last or end in this tick."""
@@ -369,7 +363,7 @@ class FlightLoop(Loop):
         self.simulator.epoch = self.epoch + faults.clock_step
         self._now = self.simulator.epoch + self.simulator.time
         for topic, value in faults.messages(self.supervisor.active, self.now()):
-            self.deliver_later(topic, value)
+            super().publish(topic, value)
         if faults.supervisor_waits:
             self.suspend(self._supervision)
         else:
