@@ -97,7 +97,7 @@ class FlightLog:
         targets: pose and trajectory targets in the order of their stamps.
         state_t, states: (S,) times and the supervisor's states.
         compute_history: controller, or another node's name without '_node' -> list of (t, report):
-            median, p99, max [ms], deadline_misses, count (cumulative).
+            median, p99, max [ms], deadline_misses, count (cumulative); ``compute`` has the newest.
         diagnostics: every other status, in the order of time.
         meta: task, conditions, seed, robot, version, if known.
         warnings: problems found while reading, one line each.

@@ -38,6 +38,8 @@ from beetle_omni_ros.model.resources import commit
 from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.show.page import print_grids, rendered, Terminal
 
+# --- flights -------------------------------------------------------------------------------------
+
 TASKS = ('random100', 'waypoints', 'lemniscate', 'force', 'torque', 'wind', 'pushes', 'payload',
          'hover')
 CONDITIONS = ('nominal', 'published')
@@ -169,6 +171,8 @@ def trace(log: FlightLog, task: Task) -> dict[str, np.ndarray]:
             'orientation_error': apart[1, index]}
     return {name: values.astype(np.float32) for name, values in kept.items()}
 
+
+# --- command -------------------------------------------------------------------------------------
 
 PAGE, NUMBERS, TEXT = 'comparison.html', 'comparison.json', 'README.md'
 FLIGHTS = '.flights'  # default folder of finished flights, in the output folder

@@ -26,6 +26,8 @@ from beetle_omni_ros.show import figures
 from beetle_omni_ros.show.figures import FAINT, INK, legend, panels
 from beetle_omni_ros.show.page import ABSENT, Grid, number
 
+# --- figures of the results of one task under one set of conditions ------------------------------
+
 FLOOR = {'position': 2e-4, 'orientation': 1e-2}  # of logarithmic errors [m], [deg]
 UNITS = {'position': 'm', 'orientation': 'deg'}
 STEP = 0.05  # [s] between points of a folded curve
@@ -140,6 +142,8 @@ _TIME = [('errors', 'Errors in time in the first flight, the disturbance dashed;
 DRAWN = {'random': _POSES, 'poses': _POSES, **dict.fromkeys(
     (*RISING, *TILTS, 'wind', 'pushes', 'payload'), _TIME)}
 
+
+# --- page ----------------------------------------------------------------------------------------
 
 DOTS = 180  # per inch
 COLOURS = 128  # of a picture; enough for thin lines with smooth edges

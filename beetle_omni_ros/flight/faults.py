@@ -42,6 +42,8 @@ from beetle_omni_ros.show.page import (
 )
 from beetle_omni_ros.sim.fault_lists import Case, chosen, load_cases
 
+# --- page ----------------------------------------------------------------------------------------
+
 NOTE = ('good: flights with the expected outcome or a better one. impact: speed of base_link at '
         'the fastest touchdown of a flight. named: median time until the supervisor detected a '
         'fault.')
@@ -169,6 +171,8 @@ def _flights(flights):
 def _counted(counts, between=', '):
     return between.join(f'{count} {text}' for text, count in counts.items())
 
+
+# --- command -------------------------------------------------------------------------------------
 
 PAGE, FLIGHTS = 'faults.html', '.flights'
 

@@ -23,6 +23,8 @@ from beetle_omni_ros.supervisor.events import ERROR as SEVERE
 from beetle_omni_ros.supervisor.parameters import SupervisorParameters
 from beetle_omni_ros.supervisor.supervisor import Supervisor
 
+# --- estimator -----------------------------------------------------------------------------------
+
 SENSOR_AGE = 0.2        # [s] an older sample is of a stuck driver or another clock
 PUBLISHED = ('tracking', 'dead_reckoning')      # a lost estimate is missed by its readers
 
@@ -54,6 +56,8 @@ class Estimator(Component):
         values = {f'rejected: {reason}': count for reason, count in self.ekf.rejected.items()}
         return level.get(self._status, OK), self._status, values
 
+
+# --- controllers ---------------------------------------------------------------------------------
 
 ODOM_AGE = 0.05         # [s] no command answers an older estimate
 JOINT_AGE = 0.1         # [s]
@@ -145,6 +149,8 @@ class ControllerComponent(Component):
             return ERROR, stepper.error, values
         return OK, getattr(controller, 'name', self.name.removesuffix('_node')), values
 
+
+# --- supervisor ----------------------------------------------------------------------------------
 
 # [s] between checks while nothing triggers a step, and without a trigger until they begin. The
 # triggers are commands in flight, otherwise estimates: steps do not depend on a timer's phase.

@@ -17,6 +17,8 @@ from beetle_omni_ros.sim.sensors import Frame
 from beetle_omni_ros.sim.simulator import Simulator
 from beetle_omni_ros.supervisor.events import INFO
 
+# --- simulated robot -----------------------------------------------------------------------------
+
 HOPELESS = 10.0     # times what all rotors produce: a larger disturbance is a mistake
 # Delayed readings first: the IMU sample triggers the estimate, which should include them.
 SENSORS = {'mocap': 'mocap/pose', 'joints': 'joint_states', 'imu': 'imu/data_raw',
@@ -109,6 +111,8 @@ class SimulatedRobot(Component):
         level = WARN if faults else OK
         return level, 'faults: ' + (', '.join(faults) or 'none'), self._devices.status()
 
+
+# --- targets of a task ---------------------------------------------------------------------------
 
 # A trajectory is published in overlapping windows: a reader would need tenths of a second to
 # decode the whole of it, and a node that starts late soon receives the next window.
