@@ -15,7 +15,7 @@ import numpy as np
 from beetle_omni_ros.bags.conversions import from_nanoseconds
 from beetle_omni_ros.bags.log import FlightLog, LogRecorder, META_KEY, motion
 from beetle_omni_ros.bags.messages import from_bytes
-from beetle_omni_ros.bags.topics import ALL, controller_of, TELLING, Topic, topic_of, TOPICS
+from beetle_omni_ros.bags.topics import ALL, controller_of, TELLING, Topic, topic_of
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.model.schema import ParameterError, read_yaml
 
@@ -221,7 +221,7 @@ def read_bag(path: str | Path) -> FlightLog:
 
 def _problems(counts, unused):
     """Return a line about missing topics, and one for each topic with unusable messages."""
-    missing = [name for name, topic in TOPICS.items() if topic.required and not counts[name]]
+    missing = [name for name, topic in ALL.items() if topic.required and not counts[name]]
     if 'target_pose' in missing and counts['target_trajectory']:
         missing.remove('target_pose')
     lines = [f"no message on {', '.join(missing)}"] if missing else []

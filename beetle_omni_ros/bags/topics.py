@@ -45,7 +45,6 @@ class Topic:
         meaning: description for the reference page.
         type, value, read, write, take: as of :class:`.conversions.Form`.
         required: whether a bag without it gets a warning.
-        in_flight: whether every bag declares it.
 
     """
 
@@ -58,7 +57,6 @@ class Topic:
     write: Callable[[Any], Any]
     take: Callable[[Any], Any]
     required: bool = False
-    in_flight: bool = True
 
 
 def _topic(name, of, qos, meaning, **options):
@@ -81,7 +79,7 @@ TABLE = (
     _topic('battery_state', form.BATTERY, SENSOR,
            'pack voltage and current, negative when discharging'),
     _topic('rotor_states', form.ROTOR, SENSOR, '`velocity` of `rotor1..4` [rad/s], positive for '
-           'both spins, NaN where unknown', in_flight=False),
+           'both spins, NaN where unknown'),
     _topic('odom', form.ODOM, ESTIMATE,
            'estimate: pose in world, twist in base_link, both covariances', required=True),
     _topic('target_pose', form.POSE_TARGET, LATCHED,
@@ -92,19 +90,17 @@ TABLE = (
     _topic('command', form.COMMAND, COMMAND,
            'selected and checked command, which the actuators execute', required=True),
     _topic('supervisor/identity', form.TEXT, LATCHED, 'identity of the supervisor; the actuators '
-           'execute commands with this identity only', in_flight=False),
+           'execute commands with this identity only'),
     _topic('supervisor/target', form.OVERRIDE, LATCHED, 'target of the supervisor, which replaces '
-           'that of the operator; without points: no replacement', in_flight=False),
+           'that of the operator; without points: no replacement'),
     _topic('supervisor/actuators', form.HEALTH, LATCHED,
-           'health of joints and rotors as JSON: the fields of `ActuatorHealth`',
-           in_flight=False),
+           'health of joints and rotors as JSON: the fields of `ActuatorHealth`'),
     _topic('reference/state', form.TEXT, LATCHED,
            '`waiting`, `flying 3/15`, `done`, `done: control lost at level 60`, or `aborted` if '
-           'the flight ended before the task', in_flight=False),
-    _topic('joint_bridge/state', form.TEXT, LATCHED, '`ready`, `waiting: WHY` or `lost: WHY`',
-           in_flight=False),
+           'the flight ended before the task'),
+    _topic('joint_bridge/state', form.TEXT, LATCHED, '`ready`, `waiting: WHY` or `lost: WHY`'),
     _topic('rotor_bridge/state', form.TEXT, LATCHED,
-           '`ready`, `waiting: WHY`, `silent: WHY` or `lost: WHY`', in_flight=False),
+           '`ready`, `waiting: WHY`, `silent: WHY` or `lost: WHY`'),
     _topic('ground_truth/odom', form.ODOM, ESTIMATE, 'true state of the simulated robot'),
     _topic('disturbance', form.WRENCH, EVENT, 'external wrench on the simulated robot until the '
            'next message: force in world, torque in base_link; a user or an experiment publishes '
@@ -116,10 +112,9 @@ TABLE = (
 )
 TARGETS = ('target_pose', 'target_trajectory')      # received with any quality of service
 ALL: dict[str, Topic] = {topic.name: topic for topic in TABLE}
-TOPICS: dict[str, Topic] = {topic.name: topic for topic in TABLE if topic.in_flight}
-"""Topics that every bag declares, with the commands of the standby controllers."""
+"""Topics that every bag declares, with those of components of others."""
 # Not of a robot alone: /NAME/command may be of a controller, and other programs have the others.
-TELLING = TOPICS.keys() - {'command', 'diagnostics', 'odom'}
+TELLING = ALL.keys() - {'command', 'diagnostics', 'odom', 'rotor_states'}
 """Topics that determine the namespace of a robot in a bag."""
 
 
@@ -130,12 +125,12 @@ def register(topic: Topic) -> None:
 
 def topic_like(known: str, name: str, meaning: str) -> Topic:
     """Return a topic with the type and values of a known one."""
-    return replace(topic_of(known), name=name, meaning=meaning, required=False, in_flight=False)
+    return replace(topic_of(known), name=name, meaning=meaning, required=False)
 
 
 def topics_with(controllers: Iterable[str]) -> dict[str, Topic]:
     """Return name -> topic of a flight with these controllers."""
-    return {**TOPICS, **{topic.name: topic for topic in map(command_topic, controllers)}}
+    return {**ALL, **{topic.name: topic for topic in map(command_topic, controllers)}}
 
 
 def controller_of(name: str) -> str:

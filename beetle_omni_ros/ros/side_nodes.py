@@ -6,7 +6,7 @@ import sys
 from rcl_interfaces.srv import SetParameters
 
 from beetle_omni_ros.bags.bag_writer import BagWriter, FRAMES, FrameWriter
-from beetle_omni_ros.bags.topics import ALL, LATCHED_LOG, LOG, SENSOR, topics_with
+from beetle_omni_ros.bags.topics import LATCHED_LOG, LOG, SENSOR, topics_with
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.component import Component, ERROR, OK, WARN
@@ -50,7 +50,7 @@ class RecorderNode(FlightNode):
         self._failure = None
         self._received = []     # (topic, type, CDR, time of receipt [s]) not yet written
         prefix = self.get_namespace().rstrip('/') + '/'
-        for name, topic in {**ALL, **topics}.items():
+        for name, topic in topics.items():
             wire.subscribe_raw(self, name, partial(self._keep, prefix + name, topic.type),
                                LATCHED_LOG if topic.qos.latched else LOG, self._on_lost)
         self.create_subscription(wire.message_class(LINE), '/rosout', partial(
