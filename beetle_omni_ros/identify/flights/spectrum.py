@@ -26,6 +26,23 @@ LEAST = 0.25         # share of a block that must count
 
 
 @dataclass(eq=False)
+class Linear:
+    """
+    A flight linearised at a point.
+
+    Attributes:
+        residual: (N, C) measured minus expected at the point.
+        slopes: (N, C, K) derivatives by the keys.
+        measured: (N, C) measurements.
+
+    """
+
+    residual: np.ndarray
+    slopes: np.ndarray
+    measured: np.ndarray
+
+
+@dataclass(eq=False)
 class Spectrum:
     """
     Cosine coefficients of one flight.

@@ -4,14 +4,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
-from beetle_omni_ros.identify.gap.series import low_pass
-from beetle_omni_ros.identify.recording.clocks import clock_damages, lag_damage
-from beetle_omni_ros.identify.recording.damage import changed, Damage
-from beetle_omni_ros.identify.recording.limits import shipped
-from beetle_omni_ros.identify.recording.readings import reading_damages, sensor_damages
-from beetle_omni_ros.identify.recording.relations import Mistake, mistakes, Relation, RELATIONS
-from beetle_omni_ros.identify.recording.signals import Signals, signals_of
+from beetle_omni_ros.identify.recording.bag import changed, Damage, NEEDED, Recording
+from beetle_omni_ros.identify.recording.parameters import shipped
+from beetle_omni_ros.identify.recording.relations import (
+    Mistake,
+    mistakes,
+    Relation,
+    RELATIONS,
+    Signals,
+    signals_of,
+)
+from beetle_omni_ros.identify.recording.series import low_pass
+from beetle_omni_ros.identify.recording.topics import (
+    clock_damages,
+    lag_damage,
+    reading_damages,
+    sensor_damages,
+)
 from beetle_omni_ros.model.parameters import RobotParameters
 
 MOST_REPAIRS = 6        # successive; a repair can reveal another damage
