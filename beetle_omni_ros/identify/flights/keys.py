@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import Any
+from operator import attrgetter
 
 import numpy as np
 
@@ -29,6 +29,23 @@ MODULES = 'module_reaction'
 # Effects without a slope at their neutral value; they need a start where they act.
 LIMITS = tuple(name for name, effect in CATALOGUE.items() if effect.starts)
 TILT_BUS, THRUST_BUS = 'base.tilt_delay', 'base.thrust_delay'   # delays of commands
+# Typical and smallest deviations of the catalogue are those of a robot of this size.
+WEIGHT, ARM = 29.8, 0.2754      # [N], [m] params/robot.yaml
+# Power of weight and of arm by which a deviation of a unit grows with the size of a robot.
+SIZE = {'N': (1, 0), 'N s/m': (1, 0), 'N s^2/m^2': (1, 0), 'N m': (1, 1), 'N s': (1, 1),
+        'N m s': (1, 1), 'm': (0, 1), 'kg m': (1, 1), 'kg m^2': (1, 2)}
+# Standard deviations between the flights of one vehicle, by key.
+FLIGHT = {'thrust_coefficient.scale': 0.017, 'rotor_thrust_coefficient.scale': 0.01,
+          'imu_accelerometer_bias.bias': 0.05,
+          'imu_gyroscope_bias.bias': 0.004, 'imu_misalignment.rotation': 0.002,
+          'mocap_misalignment.rotation': 0.002, 'rotor_dead_time.delay': 0.002}
+# Typical differences of sensors between the flights of a laboratory.
+VARYING = {'mocap_time_offset.delay': 0.008, 'imu_filter_lag.delay': 0.008,
+           'joint_feedback_delay.delay': 0.008, 'imu_accelerometer_bias.bias': 0.1,
+           'imu_gyroscope_bias.bias': 0.008, 'imu_misalignment.rotation': 0.005,
+           'mocap_misalignment.rotation': 0.005}
+AIR = 0.3               # [m/s] moves in a hall; its force is that of a typical drag
+FLIGHT_OFFSET = 0.0033          # share of the arm: centre of mass, repeats of one vehicle
 
 
 @dataclass(frozen=True)
@@ -74,10 +91,7 @@ class Key:
 
 def number_of(robot: RobotParameters, key: str) -> float | np.ndarray:
     """Value of the robot file at a dotted key."""
-    value: Any = robot
-    for part in key.split('.'):
-        value = getattr(value, part)
-    return value
+    return attrgetter(key)(robot)
 
 
 def base_of(spec: EffectParameter, value) -> np.ndarray:
@@ -168,25 +182,6 @@ def extra_keys() -> dict[str, Key]:
     for name in (TILT_BUS, THRUST_BUS):
         add(name, None, 0.005, 'BJ', parameter='delay')
     return keys
-
-
-# Typical and smallest deviations of the catalogue are those of a robot of this size.
-WEIGHT, ARM = 29.8, 0.2754      # [N], [m] params/robot.yaml
-# Power of weight and of arm by which a deviation of a unit grows with the size of a robot.
-SIZE = {'N': (1, 0), 'N s/m': (1, 0), 'N s^2/m^2': (1, 0), 'N m': (1, 1), 'N s': (1, 1),
-        'N m s': (1, 1), 'm': (0, 1), 'kg m': (1, 1), 'kg m^2': (1, 2)}
-# Standard deviations between the flights of one vehicle, by key.
-FLIGHT = {'thrust_coefficient.scale': 0.017, 'rotor_thrust_coefficient.scale': 0.01,
-          'imu_accelerometer_bias.bias': 0.05,
-          'imu_gyroscope_bias.bias': 0.004, 'imu_misalignment.rotation': 0.002,
-          'mocap_misalignment.rotation': 0.002, 'rotor_dead_time.delay': 0.002}
-# Typical differences of sensors between the flights of a laboratory.
-VARYING = {'mocap_time_offset.delay': 0.008, 'imu_filter_lag.delay': 0.008,
-           'joint_feedback_delay.delay': 0.008, 'imu_accelerometer_bias.bias': 0.1,
-           'imu_gyroscope_bias.bias': 0.008, 'imu_misalignment.rotation': 0.005,
-           'mocap_misalignment.rotation': 0.005}
-AIR = 0.3               # [m/s] moves in a hall; its force is that of a typical drag
-FLIGHT_OFFSET = 0.0033          # share of the arm: centre of mass, repeats of one vehicle
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,16 @@ LOPSIDED = 0.2          # asymmetry of an interval from which a sentence states 
 SPELLED = {'imu': 'IMU', 'mocap': 'MoCap'}
 SHOWN = 6               # channels and candidates in the terminal
 LEAST_CHANCE = 1e-6     # below, a probability is not stated as a number
+BEFORE, AFTER = COLOURS[1], COLOURS[0]
+VERDICT_COLOURS = {'no_gap': '#2b7a3d', 'named': '#1f5fa8', 'named_set': '#1f5fa8',
+                   'unknown': '#b06a00', 'not_decidable': '#b06a00', 'bad_data': '#b3261e'}
+# Topic -> label of an axis -> names of its readings.
+LABELS = {
+    'imu/data_raw': {'force [m/s^2]': 'xyz', 'rate [rad/s]': 'xyz'},
+    'mocap/pose': {'position [m]': 'xyz', 'quaternion': 'xyzw'},
+    'joint_states': {'tilt [rad]': '1234'},
+    'command': {'tilt [rad]': '1234', 'thrust [N]': '1234'}}
+HEIGHT = 0.24   # [in] of a row of a figure
 
 
 def headline(result: dict) -> str:
@@ -246,18 +256,6 @@ def _spans(interval):
     if isinstance(interval[0], list):
         return ', '.join(f'{a:.3g}..{b:.3g}' for a, b in interval)
     return f'{interval[0]:.4g}..{interval[1]:.4g}'
-
-
-BEFORE, AFTER = COLOURS[1], COLOURS[0]
-VERDICT_COLOURS = {'no_gap': '#2b7a3d', 'named': '#1f5fa8', 'named_set': '#1f5fa8',
-                   'unknown': '#b06a00', 'not_decidable': '#b06a00', 'bad_data': '#b3261e'}
-# Topic -> label of an axis -> names of its readings.
-LABELS = {
-    'imu/data_raw': {'force [m/s^2]': 'xyz', 'rate [rad/s]': 'xyz'},
-    'mocap/pose': {'position [m]': 'xyz', 'quaternion': 'xyzw'},
-    'joint_states': {'tilt [rad]': '1234'},
-    'command': {'tilt [rad]': '1234', 'thrust [N]': '1234'}}
-HEIGHT = 0.24   # [in] of a row of a figure
 
 
 def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str:

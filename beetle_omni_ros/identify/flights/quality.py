@@ -17,14 +17,17 @@ from dataclasses import dataclass
 from math import log
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import f as f_law
 from scipy.stats import t as student
 
-from beetle_omni_ros.identify.flights.discrepancy import acting, discrepancies, LEAN
+from beetle_omni_ros.identify.flights.discrepancy import acting, discrepancies, features_of
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import Solution
 from beetle_omni_ros.identify.flights.spectrum import pooled, Spectrum, spectrum
+
+SIZES = (0.001, 0.003, 0.01, 0.03, 0.1)     # amplitudes relative to hover thrust and weight
+SLOWEST = 1.0                               # [Hz] of a line; slower ones are the flight's own path
+NEAR = 12                                   # frequencies on each side that a line is compared with
 
 
 def fitted(engine: Engine, solution: Solution, k: int) -> np.ndarray:
@@ -130,13 +133,6 @@ def left_of(engine: Engine, solution: Solution) -> list[np.ndarray]:
     return rows
 
 
-WAVES = 12                                  # random features
-SIZES = (0.001, 0.003, 0.01, 0.03, 0.1)     # amplitudes relative to hover thrust and weight
-SLOWEST = 1.0                               # [Hz] of a line; slower ones are the flight's own path
-NEAR = 12                                   # frequencies on each side that a line is compared with
-TURN, SWING = 1.0, 2.0                      # [rad/s] scales of rates of the body and of tilts
-
-
 @dataclass(frozen=True)
 class Unexplained:
     """
@@ -167,19 +163,6 @@ class Unexplained:
         return f'no known effect explains {what} (probability {self.probability:.1g})'
 
 
-def features(motion: dict[str, np.ndarray], time: np.ndarray) -> np.ndarray:
-    """(N, P) state of the robot in units of order one, and random waves of it."""
-    rotation = Rotation.from_quat(motion['quaternion']).as_matrix()
-    velocity = np.einsum('nji,nj->ni', rotation, motion['velocity'])
-    plain = np.concatenate([
-        velocity, rotation[:, 2] / LEAN, motion['position'], time[:, None] / 60, motion['tilt'],
-        motion['tilt_rate'] / SWING, motion['rate'] / TURN], axis=1)
-    rng = np.random.default_rng(1)
-    waves = np.cos(plain @ rng.normal(size=(plain.shape[1], WAVES)) / np.sqrt(3)
-                   + rng.uniform(0, 2 * np.pi, WAVES))
-    return np.concatenate([plain, waves], axis=1)
-
-
 def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
                filters: list[np.ndarray], channels: tuple[str, ...]) -> Unexplained:
     """
@@ -193,7 +176,7 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
         channels: names of all channels.
 
     """
-    every = [features(flight.motion, flight.time) for flight in flights]
+    every = [features_of(flight.motion, flight.time, quick=True) for flight in flights]
     mean = np.concatenate(every).mean(axis=0)
     info, score = [], []
     own = spectra[0].groups[0]

@@ -8,6 +8,8 @@ from scipy.stats import t as student
 
 HUBER = 3.0                 # standard deviations from which the loss is linear
 SIGMA_OF_MEDIAN = 1.4826    # standard deviation over the median of the size, normal distribution
+LEVELS = 10.0 ** np.arange(0, 5)    # tried variances of a drift
+CORNERS = (0.5, 2.0, 8.0)           # tried
 
 
 def huber(white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -53,10 +55,6 @@ def interval(every: np.ndarray) -> np.ndarray:
     count = len(every) - 1
     half = student.ppf(0.975, count - 1) * np.sqrt((count - 1) * every[1:].var())
     return every[0] + half * np.array([-1, 1])
-
-
-LEVELS = 10.0 ** np.arange(0, 5)    # tried variances of a drift
-CORNERS = (0.5, 2.0, 8.0)           # tried
 
 
 class Drifting:

@@ -11,8 +11,8 @@ from beetle_omni_ros.identify.recording.relations import (
     mistakes,
     Relation,
     RELATIONS,
-    Signals,
     signals_of,
+    Smoothed,
 )
 from beetle_omni_ros.identify.recording.series import low_pass
 from beetle_omni_ros.identify.recording.topics import (
@@ -142,7 +142,7 @@ class Comparison:
 
     """
 
-    def __init__(self, name: str, signals: Signals):
+    def __init__(self, name: str, signals: Smoothed):
         self.name, self.signals, self.limits = name, signals, (limits := shipped())
         period = float(np.diff(signals.t[:2])[0])
         self.kernel = low_pass(limits.edge, 2, period)
@@ -159,7 +159,7 @@ class Comparison:
         # A contradiction of thrusts may follow from another one.
         self.wrong = [name for name in wrong if RELATIONS[name].certain] or wrong
 
-    def _agreement(self, relation: Relation, signals: Signals) -> Agreement:
+    def _agreement(self, relation: Relation, signals: Smoothed) -> Agreement:
         late, early = (self.kernel(x)[:len(self.centres)][self.fine]
                        for x in relation.pair(signals))
         return Agreement(late, early, self.limits.noise**2 * sum(

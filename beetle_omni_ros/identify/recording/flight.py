@@ -28,6 +28,8 @@ from beetle_omni_ros.identify.recording.topics import begin_of
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
+TABLES = ('.csv', '.gz')     # endings of files that are no bags
+
 
 def flown(recording: Recording, robot: RobotParameters,
           p: GapParameters) -> tuple[Recording, float] | None:
@@ -76,9 +78,6 @@ def _aloft(recording, when, begin, end, p):
     begin = (high[0] if len(high) else begin) + p.settle
     flying = [at for at, state in recording.states if state.startswith('flying') and at < end]
     return max([begin, *flying[:1]]), end
-
-
-TABLES = ('.csv', '.gz')     # endings of files that are no bags
 
 
 class UnusableFlight(ValueError):

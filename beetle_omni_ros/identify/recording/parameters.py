@@ -12,6 +12,9 @@ from beetle_omni_ros.model import schema
 from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import parameter, ParameterFile
 
+limit = partial(parameter, low=0)
+between = partial(parameter, shape=(2,))
+
 
 def _time(doc, low=1e-4, high=600.0):
     return parameter(doc=doc, unit='s', low=low, high=high)
@@ -94,10 +97,6 @@ class GapParameters:
         shipped = share_path('params/gap.yaml')
         values = schema.load_yaml(shipped) | (schema.load_yaml(path) if path else {}) | changed
         return schema.bind(cls, values, str(path or shipped))
-
-
-limit = partial(parameter, low=0)
-between = partial(parameter, shape=(2,))
 
 
 @dataclass(frozen=True, eq=False)

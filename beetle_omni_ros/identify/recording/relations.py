@@ -25,7 +25,7 @@ THINNED = 4             # points of the fine grid for each point of the coarse o
 
 
 @dataclass(frozen=True)
-class Signals:
+class Smoothed:
     """
     All topics of one flight on one grid, below three times the edge of the comparisons.
 
@@ -46,7 +46,7 @@ class Signals:
     noise: dict[str, np.ndarray]
     robot: RobotParameters
 
-    def corrected(self, topic: str, undo: np.ndarray) -> 'Signals':
+    def corrected(self, topic: str, undo: np.ndarray) -> 'Smoothed':
         """The same with ``undo`` (width, width) applied to the values of one topic."""
         return replace(self, data=self.data | {topic: self.data[topic] @ undo.T},
                        noise=self.noise | {topic: undo**2 @ self.noise[topic]})
@@ -77,7 +77,7 @@ class Signals:
         return self.data[IMU][0, :, :3], force / self.robot.mass
 
 
-def signals_of(recording: Recording, robot: RobotParameters) -> Signals | None:
+def signals_of(recording: Recording, robot: RobotParameters) -> Smoothed | None:
     """Smooth all topics with the same filter; None if they have too little time in common."""
     limits = shipped()
     series = {topic: series_of(recording, topic) for topic in (IMU, POSE, JOINTS, COMMAND)}
@@ -105,7 +105,7 @@ def signals_of(recording: Recording, robot: RobotParameters) -> Signals | None:
         for k in np.flatnonzero(np.diff(t) > limits.period[1]):
             silent |= (at > t[k]) & (at < t[k + 1])
         noise[topic] = white_noise(values)**2 * np.median(np.diff(t))
-    return Signals(at, data, silent, noise, robot)
+    return Smoothed(at, data, silent, noise, robot)
 
 
 def series_of(recording: Recording, topic: str) -> tuple[np.ndarray, np.ndarray]:
@@ -146,7 +146,7 @@ class Relation:
     late: str
     early: str
     words: str
-    pair: Callable[[Signals], tuple[np.ndarray, np.ndarray]]
+    pair: Callable[[Smoothed], tuple[np.ndarray, np.ndarray]]
     noise: tuple[tuple[str, int, int], ...]
     gain: str
     lag: str = ''
@@ -154,13 +154,13 @@ class Relation:
 
 
 RELATIONS = {
-    'turning': Relation(POSE, IMU, 'rotation of the pose and gyroscope', Signals.turning,
+    'turning': Relation(POSE, IMU, 'rotation of the pose and gyroscope', Smoothed.turning,
                         ((IMU, 3, 0), (POSE, 3, 1)), 'gain', 'sensor_lag'),
-    'pushing': Relation(POSE, IMU, 'motion of the pose and accelerometer', Signals.pushing,
+    'pushing': Relation(POSE, IMU, 'motion of the pose and accelerometer', Smoothed.pushing,
                         ((IMU, 0, 0), (POSE, 0, 2)), 'gain'),
-    'tilting': Relation(JOINTS, COMMAND, 'encoders and tilt commands', Signals.tilting,
+    'tilting': Relation(JOINTS, COMMAND, 'encoders and tilt commands', Smoothed.tilting,
                         ((JOINTS, 0, 0),), 'gain', 'servo_lag'),
-    'lifting': Relation(IMU, COMMAND, 'accelerometer and thrust commands', Signals.lifting,
+    'lifting': Relation(IMU, COMMAND, 'accelerometer and thrust commands', Smoothed.lifting,
                         ((IMU, 0, 0),), 'thrust_gain', certain=False)}
 
 
@@ -175,7 +175,7 @@ class Mistake:
         text: cause in words.
         undo: (width, width) map from recorded to right columns.
         fix: description of the repair; empty without one.
-        part: key of the changed :class:`Signals`, if not ``topic``.
+        part: key of the changed :class:`Smoothed`, if not ``topic``.
 
     """
 

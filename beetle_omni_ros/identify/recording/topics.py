@@ -23,10 +23,18 @@ from beetle_omni_ros.identify.recording.bag import (
     Recording,
 )
 from beetle_omni_ros.identify.recording.parameters import shipped
-from beetle_omni_ros.identify.recording.relations import Relation, series_of, Signals, white_noise
+from beetle_omni_ros.identify.recording.relations import Relation, series_of, Smoothed, white_noise
 from beetle_omni_ros.identify.recording.series import matrices
 
 OVERLAP = 6     # windows that share a sample; a motion counts once
+NEIGHBOURS = 7          # readings of a running median
+# Topic, first column, names of columns, unit. The rows have the order of ``scatter``.
+SENSORS = (
+    (IMU, 0, [f'linear_acceleration.{a}' for a in 'xyz'], 'm/s^2'),
+    (IMU, 3, [f'angular_velocity.{a}' for a in 'xyz'], 'rad/s'),
+    (POSE, 0, [f'position.{a}' for a in 'xyz'], 'm'),
+    (POSE, 3, [f'orientation.{a}' for a in 'xyzw'], 'rad'),
+    (JOINTS, 0, [f'gimbal{k}' for k in range(1, 5)], 'rad'))
 
 
 def begin_of(recording: Recording) -> float:
@@ -106,7 +114,7 @@ def _age(recording, topic, ages):
                   fix='shift the stamps', repair=lambda r: changed(r, topic, times=t + late))
 
 
-def lag_damage(name: str, relation: Relation, signals: Signals) -> Damage | None:
+def lag_damage(name: str, relation: Relation, signals: Smoothed) -> Damage | None:
     """A lag of two motions that is out of range, steps or drifts."""
     late, early = (np.linalg.norm(x, axis=1) for x in relation.pair(signals))
     at, lags = window_lags(signals.t, late, early, signals.silent)
@@ -188,16 +196,6 @@ def window_lags(t: np.ndarray, late: np.ndarray, early: np.ndarray, gaps: np.nda
             at.append(moment)
             lags.append(period * (first - begin - k - 0.5 * (a - c) / min(a - 2 * b + c, -1e-12)))
     return np.array(at[1:]), np.array(lags)
-
-
-NEIGHBOURS = 7          # readings of a running median
-# Topic, first column, names of columns, unit. The rows have the order of ``scatter``.
-SENSORS = (
-    (IMU, 0, [f'linear_acceleration.{a}' for a in 'xyz'], 'm/s^2'),
-    (IMU, 3, [f'angular_velocity.{a}' for a in 'xyz'], 'rad/s'),
-    (POSE, 0, [f'position.{a}' for a in 'xyz'], 'm'),
-    (POSE, 3, [f'orientation.{a}' for a in 'xyzw'], 'rad'),
-    (JOINTS, 0, [f'gimbal{k}' for k in range(1, 5)], 'rad'))
 
 
 def reading_damages(recording: Recording, unclocked: Container[str] = ()) -> list[Damage]:
