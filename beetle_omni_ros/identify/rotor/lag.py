@@ -9,7 +9,7 @@ the command times a gain of each window of time.
 import numpy as np
 
 from beetle_omni_ros.identify.inference.hierarchy import design, solve, Spread, WIDTH
-from beetle_omni_ros.identify.inference.robust import consecutive
+from beetle_omni_ros.identify.inference.noise import consecutive
 from beetle_omni_ros.identify.rotor.log import RotorLog
 
 FIRST = 0.05            # [s] time constant to start from
