@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from servo_logs import COUNT, log_of, sweep, trapezoid
 
-from beetle_omni_ros.identify.servo.joint import identify, interval, joint_results, left_out_rms
 from beetle_omni_ros.identify.servo.model import INDEX
+from beetle_omni_ros.identify.servo.results import identify, interval, joint_results, left_out_rms
 from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()

@@ -19,13 +19,14 @@ from beetle_omni_ros.identify.inference.noise import Drifting, drifting
 from beetle_omni_ros.identify.inference.robust import HUBER, scale_of
 from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.identify.servo.model import (
+    ENTRIES,
     INDEX,
+    LIMITS,
     NAMES,
     READING_ERRORS,
     simulate,
     TERMS,
 )
-from beetle_omni_ros.identify.servo.robot import ENTRIES, LIMITS
 from beetle_omni_ros.model.effects import CATALOGUE
 
 LOGARITHMIC = np.array([term.logarithmic for term in TERMS.values()])
@@ -360,4 +361,9 @@ def error_rms(log: JointLog, joint: int, values: np.ndarray, held: bool = True,
     rows = np.arange(len(log.t))[part]
     rows = rows[log.fresh[rows]]
     error = simulate(log, joint, values[None], held)[0] - log.measured[joint]
-    return float(np.sqrt(np.mean(error[rows]**2)))
+    return rms(error[rows])
+
+
+def rms(values: np.ndarray) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))
