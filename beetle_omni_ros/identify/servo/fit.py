@@ -125,8 +125,10 @@ class Servos:
                                 KINDS)
         self.blocks = [kind + KINDS * k for kind, (k, *_) in zip(kinds, self.units,
                                                                     strict=True)]
-        # Each log is predicted from the others, or each kind of motion of one or two logs.
-        self.folds = np.arange(KINDS * len(logs)) // (KINDS if len(logs) > 2 else 1)
+        # Each log is predicted from the others, or each kind of motion of one or two logs. A log
+        # need not show every kind.
+        self.folds = np.arange(1 + max(block.max() for block in self.blocks)) // (
+            KINDS if len(logs) > 2 else 1)
 
     # ---- model of the core
     def __call__(self, theta: np.ndarray, active: np.ndarray):
