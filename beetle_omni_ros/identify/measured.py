@@ -16,7 +16,7 @@ import numpy as np
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.identify.rotor.log import COLUMNS, EXPECTED, read_rotor_log, UntimedError
-from beetle_omni_ros.identify.servo.fit import decoded, Found, HIGH, LOW, STARTS, Trial
+from beetle_omni_ros.identify.servo.fit import decoded, Found, HIGH, LOW, ServoModel, STARTS
 from beetle_omni_ros.identify.servo.log import HEADER, is_bag, read_joint_log
 from beetle_omni_ros.identify.servo.model import catalogue_values, INDEX, JOINTS, own_delay
 from beetle_omni_ros.model.catalogue import settings
@@ -144,7 +144,7 @@ def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict
     return effects, intervals, origin
 
 
-def _entries(found: Found, trial: Trial, log: int | None, robot: RobotParameters, draws: int
+def _entries(found: Found, trial: ServoModel, log: int | None, robot: RobotParameters, draws: int
              ) -> dict[str, dict[str, np.ndarray]]:
     """
     Entries of a log, or of the mean of all logs (None): (joints, draws) values of each parameter.

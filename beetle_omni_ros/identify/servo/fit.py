@@ -85,7 +85,7 @@ def kinds_of_motion(parts: Sequence[tuple], count: int) -> list[np.ndarray]:
 
 
 @dataclass(frozen=True)
-class Trial:
+class ServoModel:
     """A model: the entries that may differ from the base, except at some units, and their fit."""
 
     entries: tuple[str, ...]
@@ -164,7 +164,7 @@ class Servos:
         return read[0], change
 
     # ---- fits
-    def estimate_noise(self, entries: Sequence[str], start=()) -> Trial:
+    def estimate_noise(self, entries: Sequence[str], start=()) -> ServoModel:
         """
         Measure the noise around a model; call it before :meth:`fit`.
 
@@ -189,7 +189,7 @@ class Servos:
         return self.fit(entries, starts=(trial,))
 
     def fit(self, entries: Sequence[str], starts: Sequence = (),
-            still: np.ndarray | None = None) -> Trial:
+            still: np.ndarray | None = None) -> ServoModel:
         """
         Fit the terms of some entries; the others have their base values.
 
@@ -207,7 +207,7 @@ class Servos:
         fits = []
         for start in starts or STARTS:
             target = self.base.copy()
-            if isinstance(start, Trial):
+            if isinstance(start, ServoModel):
                 target[:, active] = start.fit.theta[:, active]
             else:
                 limits = [log.reached() for log in self._parts]
@@ -218,9 +218,10 @@ class Servos:
                         target[:, p] = np.log(value) if LOGARITHMIC[p] else value
             x = self._nearest(s, target)
             fits.append(solve(self, self.base, s, x, self.blocks, self.low, HIGH, self.folds))
-        return Trial(tuple(entries), min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x), still)
+        best = min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x)
+        return ServoModel(tuple(entries), best, still)
 
-    def visible(self, one: Trial, other: Trial) -> np.ndarray:
+    def visible(self, one: ServoModel, other: ServoModel) -> np.ndarray:
         """
         (U,) whether two fits differ in the readings of a unit by an encoder count (RMS).
 
@@ -233,7 +234,7 @@ class Servos:
                          for a, b, sigma, (k, *_) in zip(*reads, self.sigma, self.units,
                                                          strict=True)])
 
-    def changed(self, trial: Trial, entry: str) -> np.ndarray:
+    def changed(self, trial: ServoModel, entry: str) -> np.ndarray:
         """(U,) whether a unit differs from the base by an entry, by a Wald test at 5 %."""
         terms = mask([entry])
         off = (trial.fit.theta - self.base)[:, terms]
@@ -242,7 +243,7 @@ class Servos:
                          for o, c in zip(off, spread, strict=True)])
         return size > chi2.isf(0.05 / len(off), terms.sum())
 
-    def determined(self, trial: Trial, entry: str) -> bool:
+    def determined(self, trial: ServoModel, entry: str) -> bool:
         """Whether the logs halve the variance of every combination of an entry's terms."""
         s, terms = trial.fit.s, mask([entry])
         prior, left = (each[:, terms][:, :, terms]
@@ -285,12 +286,12 @@ class Found:
     """
 
     servos: Servos
-    full: Trial
-    chosen: Trial
-    trials: dict[str, Trial]
+    full: ServoModel
+    chosen: ServoModel
+    trials: dict[str, ServoModel]
     gains: dict[str, float]
 
-    def values(self, trial: Trial | None = None) -> np.ndarray:
+    def values(self, trial: ServoModel | None = None) -> np.ndarray:
         """(U, P) parameter sets of the units."""
         return decoded((trial or self.chosen).fit.theta)
 

@@ -17,8 +17,8 @@ from beetle_omni_ros.identify.servo.fit import (
     mask,
     rms,
     select,
+    ServoModel,
     Servos,
-    Trial,
 )
 from beetle_omni_ros.identify.servo.log import FITTED, JointLog
 from beetle_omni_ros.identify.servo.model import (
@@ -60,7 +60,7 @@ def identify(logs: Sequence[JointLog], robot: RobotParameters, as_file: bool = F
     return select(Servos(logs, file_sets(robot, flown=True), as_file), always, allowed)
 
 
-def interval(found: Found, trial: Trial, unit: int, name: str) -> tuple[float, float]:
+def interval(found: Found, trial: ServoModel, unit: int, name: str) -> tuple[float, float]:
     """95 % interval of a term of a unit; open for a limit that the logs did not reach."""
     p = INDEX[name]
     log = found.servos.logs[found.servos.units[unit][0]]
