@@ -101,7 +101,8 @@ def flying(tmp_path):
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros', 'fly', '--task', str(task), '--bag',
          str(bag), '--alone', '--clock', 'simulated', '--component', OBSERVER],
-        stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, 'TMPDIR': str(temporary)})
+        stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, 'TMPDIR': str(temporary)})
     deadline = time.monotonic() + READY
     try:
         while not any(b'flying:nmpc' in file.read_bytes() for file in bag.glob('*.mcap')):
