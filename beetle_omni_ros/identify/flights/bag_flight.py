@@ -21,7 +21,6 @@ from beetle_omni_ros.identify.flights.servo import (
     module_load,
     simulate,
     spin_load,
-    targets_at,
     undescribed_load,
     Windows,
 )
@@ -298,9 +297,18 @@ class BagFlight:
     def _servos(self, sets, at):
         """Simulated servos (P, W, M, 4) of each set, with initial states and loads at ``at``."""
         windows, edges = self._windows(at)
-        targets = [targets_at(self.signals, theta, edges) for theta in sets]
+        delays = [self.signals.delays(theta)[0] for theta in sets]
+        of_delays = {delay: self._targets(edges, delay) for delay in set(delays)}
+        targets = [of_delays[delay] for delay in delays]
         runs = simulate(self.robot, windows, np.array(targets), sets, self.modules)
         return runs.transpose(0, 2, 1, 3)
+
+    def _targets(self, edges, delay):
+        """(K, W, 4) mean delayed commands [rad] between the steps ``edges`` (W, K + 1) [s]."""
+        means = self.signals.tilt_targets(edges.ravel(), delay)
+        # The mean from the end of a window to the next one is dropped.
+        means = np.concatenate([means, means[-1:]]).reshape(*edges.shape, 4)
+        return means[:, :-1].transpose(1, 0, 2)
 
     def _joint_slopes(self, theta, names):
         """
