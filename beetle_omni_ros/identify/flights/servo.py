@@ -48,13 +48,6 @@ class Windows:
     undescribed: tuple[np.ndarray, ...] = ()
 
 
-def targets_at(signals: Signals, theta: dict[str, float], edges: np.ndarray) -> np.ndarray:
-    """(K, W, 4) mean delayed commands [rad] between the steps ``edges`` (W, K + 1) [s]."""
-    means = signals.tilt_targets(edges.ravel(), signals.delays(theta)[0])
-    # The mean from the end of a window to the next one is dropped.
-    return np.concatenate([means, means[-1:]]).reshape(*edges.shape, 4)[:, :-1].transpose(1, 0, 2)
-
-
 def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
              sets: list[dict[str, float]], modules: float) -> np.ndarray:
     """
