@@ -16,7 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.model.catalogue import delaying
+from beetle_omni_ros.model.effects import delaying
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.parts import JointParameters
 

@@ -7,7 +7,7 @@ from flights import KEYS, model, Motion, P, ROBOT, solved, STEP
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.residual import limit_starts
+from beetle_omni_ros.identify.gap.residual import starts_of
 from beetle_omni_ros.identify.gap.servo import (
     module_load,
     simulate,
@@ -16,7 +16,6 @@ from beetle_omni_ros.identify.gap.servo import (
     Windows,
 )
 from beetle_omni_ros.identify.gap.signals import Signals
-from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
 
 MOTION = Motion(9, 12.0)
@@ -159,7 +158,7 @@ def test_the_gyroscopic_load_on_a_joint_agrees_with_euler():
 
 def test_a_torque_limit_is_recovered_from_samples_at_the_limit():
     made, key = model(flight(servo(effort=0.05))), 'joint_torque_limit.effort_limit'
-    begin = limit_starts(KEYS[key], CATALOGUE['joint_torque_limit'], [made])
+    begin = starts_of(KEYS[key], [made])
     tried = [start[0] for start in begin]
     rest = [np.square(made.residual(theta, 'J')['J']).mean()
             for theta in ({}, *({key: x} for x in tried))]

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from beetle_omni_ros.model.catalogue import validated
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE, validated
 from beetle_omni_ros.train import model, physics
 
 EFFECTS = validated({

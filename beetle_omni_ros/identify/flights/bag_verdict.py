@@ -21,8 +21,9 @@ from beetle_omni_ros.identify.gap.keys import (
     tolerances,
 )
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.residual import limit_starts
+from beetle_omni_ros.identify.gap.residual import starts_of
 from beetle_omni_ros.identify.gap.signals import IMU_LAG
+from beetle_omni_ros.identify.gap.treatment import TREATMENTS
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
 
@@ -30,9 +31,6 @@ LATE = 0.012, 0.024          # [s] latencies at which the tilting modules are de
 COMPARED = {group: {'used': True, 'channels': [c for c in BagFlight.channels
                                                if c.startswith(group)]}
             for group in ('force', 'torque', 'acceleration', 'rate', 'joint')}
-# Deviations at which effects without a slope at zero begin; those of limits follow from flights.
-STARTS = {'joint_friction': ((0.003, 0.003), (0.008, 0.008), (0.02, 0.02)),
-          'joint_backlash': ((0.005,), (0.02,), (0.05,))}
 
 
 def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapParameters,
@@ -86,10 +84,8 @@ def _starts(keys, models):
     """Name of a start -> deviations of the keys of its effect."""
     result = {}
     for name in LIMITS:
-        effect = CATALOGUE[name]
         own = [key for key in keys.values() if key.effect == name and not key.form]
-        values = limit_starts(own[0], effect, models) if effect.limit else STARTS[name]
-        for k, start in enumerate(values):
+        for k, start in enumerate(starts_of(own[0], models)):
             result[f'{name}@{k}'] = dict(zip([key.name for key in own], start, strict=True))
     return result
 
@@ -121,5 +117,5 @@ def _priors(robot, keys, p, starts, coarse):
         spreads[start] = Spread(0.03, 1.0, 0.0)
         spreads |= {name: Spread(0.001, 0.3, 0.0) for name in tangents}
         name = start.partition('@')[0]
-        entries.append(Entry(name, (start, *tangents), None, CATALOGUE[name].channels == 'B'))
+        entries.append(Entry(name, (start, *tangents), None, TREATMENTS[name].channels == 'B'))
     return [*spreads], spreads, entries

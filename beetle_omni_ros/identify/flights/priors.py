@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.identify.gap.keys import all_keys, Key, names_of
+from beetle_omni_ros.identify.gap.treatment import TREATMENTS
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
 
@@ -86,7 +87,7 @@ def spread(robot: RobotParameters, key: Key, tolerance: float, stamps: float) ->
             np.linalg.norm(robot.rotors.positions[:, :2], axis=1).mean())
     if plain == 'rotor_dead_time.delay':
         flight = max(flight, stamps)
-    typical = AIR * CATALOGUE['rotor_drag'].parameters['coefficient'].typical if (
+    typical = AIR * TREATMENTS['rotor_drag'].sizes['coefficient'].typical if (
         plain == 'wind.force') else key.typical
     return Spread(tolerance or 0.5 * key.smallest * size, typical * size, flight)
 
@@ -99,7 +100,8 @@ def entries_of(keys: dict[str, Key]) -> list[Entry]:
         own = tuple(key for parameter in effect.numbers for key in names_of(name, parameter)
                     if key in keys)
         # noise of IMU and MoCap reaches the commands; servos are simulated from commands
-        body = effect.channels[:1] in 'BAW' and 'J' not in effect.channels
+        channels = TREATMENTS[name].channels
+        body = channels[:1] in 'BAW' and 'J' not in channels
         result += [Entry(name, (key,), k + 1, body) for k, key in enumerate(own)] \
             if effect.each else [Entry(name, own, None, body)]
     return result

@@ -24,6 +24,7 @@ from beetle_omni_ros.identify.gap.servo import (
     Windows,
 )
 from beetle_omni_ros.identify.gap.signals import Signals
+from beetle_omni_ros.identify.gap.treatment import TREATMENTS
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.servo import NUMPY, Servo
 
@@ -196,15 +197,18 @@ class FlightModel:
                        round(p.grid / p.servo_step), tuple(more)), edges
 
 
-def limit_starts(key, effect, models):
-    """Starts at which a limit begins to act in these flights."""
-    what, below = effect.limit
+def starts_of(key, models):
+    """Starts of an effect without a slope; of a limit, where it begins to act in these flights."""
+    treatment = TREATMENTS[key.effect]
+    if treatment.limit is None:
+        return treatment.starts
+    what, below = treatment.limit
     most = max(float({
         'tilt_rate': lambda m: np.abs(m.signals.joints({})[1]).max(),
         'torque': lambda m: np.quantile(np.abs(_torques(m)), 0.999),
         'thrust': lambda m: np.quantile(m.flight.command[:, 4:], 0.999)}[what](m))
         for m in models)
-    return tuple((float(np.log(part * most / key.base)),) for part, in effect.starts
+    return tuple((float(np.log(part * most / key.base)),) for part, in treatment.starts
                  if part * most < below * key.base)
 
 

@@ -23,8 +23,7 @@ from beetle_omni_ros.identify.gap.series import (
     within,
 )
 from beetle_omni_ros.identify.recording.signals import white_noise
-from beetle_omni_ros.model.catalogue import ignored
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE, ignored
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.servo import play
 

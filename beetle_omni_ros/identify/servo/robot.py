@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.servo.model import INDEX, NAMES, OFF, TERMS
-from beetle_omni_ros.model.catalogue import delaying
-from beetle_omni_ros.model.effects import per_joint
+from beetle_omni_ros.model.effects import delaying, per_joint
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import load_yaml
