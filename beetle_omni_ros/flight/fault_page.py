@@ -8,7 +8,7 @@ import numpy as np
 from beetle_omni_ros.flight.fault_flights import PLAN
 from beetle_omni_ros.show import page as shared
 from beetle_omni_ros.show.page import ABSENT, Grid, html, markdown, number, section, verdict_head
-from beetle_omni_ros.sim.fault_lists import Case
+from beetle_omni_ros.sim.faults import Case
 
 NOTE = ('good: flights with the expected outcome or a better one. impact: speed of base_link at '
         'the fastest touchdown of a flight. named: median time until the supervisor detected a '

@@ -29,7 +29,7 @@ from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import commit
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.show.page import print_grids
-from beetle_omni_ros.sim.fault_lists import chosen, load_cases
+from beetle_omni_ros.sim.faults import chosen, load_cases
 
 PAGE, FLIGHTS = 'faults.html', '.flights'
 

@@ -20,7 +20,7 @@ from beetle_omni_ros.flight.fault_flights import (
     PLAN,
     Trial,
 )
-from beetle_omni_ros.sim.fault_lists import load_cases
+from beetle_omni_ros.sim.faults import load_cases
 
 QUICK = replace(PLAN, hover_time=0.5, watch_time=1.0, jitter=0.2, height=1.1, end_time=0.3,
                 turn_time=0.05, landing_time=10.0, healthy_time=1.0, pose_time=1.0)

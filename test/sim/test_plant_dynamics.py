@@ -8,7 +8,7 @@ import pytest
 from sim_robots import HIGH, momenta, plant, ROBOT, WORLD
 
 from beetle_omni_ros.model import rotations
-from beetle_omni_ros.sim.mjcf import PAYLOAD_DEPTH
+from beetle_omni_ros.sim.plant import PAYLOAD_DEPTH
 
 WEIGHTLESS = replace(ROBOT, gravity=0.0)
 
