@@ -86,11 +86,6 @@ TRAIN = [
     'torch>=2.8,<3',
 ]
 
-# Clusters for `beetle_omni compare --backend ray`; 80 MB. Wheels for Python 3.13 begin with 2.45.
-RAY = [
-    'ray>=2.45',
-]
-
 # colcon looks for pytest under the name `test` before it runs pytest.
 TEST = [
     'hypothesis>=6.100',
@@ -137,7 +132,6 @@ setup(
         'ros': ROS,
         'hardware': HARDWARE,
         'train': TRAIN,
-        'ray': RAY,
         'test': TEST,
         'dev': DEVELOPMENT,
     },

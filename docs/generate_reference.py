@@ -109,9 +109,9 @@ STATUS = """\
 TIMES = """The functions of `import beetle_omni_ros as bo`, which `help` shows too. They need no
 ROS. Short scripts are in `examples/`.
 
-The times of a recorded flight (`bo.read_run`) are absolute, in seconds since 1970-01-01 UTC. Those
-of `bo.simulate` begin at 0. `log.imu_t - log.start` is the time since the start of either. The
-times of a `TrajectoryTarget`, and the argument of `target.at(t)`, are on the same clock.
+The times of a flight are absolute, in seconds since 1970-01-01 UTC; `log.imu.t - log.start` is the
+time since its start. The times of a `TrajectoryTarget`, and the argument of `target.at(t)`, are on
+the same clock.
 """
 
 
@@ -320,7 +320,7 @@ def python() -> str:
         given = [one.replace(annotation=inspect.Parameter.empty) for one in
                  inspect.signature(function).parameters.values() if one.name != 'self']
         text.append(_documented(name, f'bo.{name}{inspect.Signature(given)}', function))
-    for kind in (log.FlightLog, log.Commands, base.PoseTarget, base.TrajectoryTarget,
+    for kind in (log.FlightLog, log.Series, base.PoseTarget, base.TrajectoryTarget,
                  base.Reference):
         text.append(_documented(kind.__name__, kind.__name__, kind))
     return ''.join(text)

@@ -15,7 +15,7 @@ ALLOWED = {
     'model': (),
     'control': ('model',),
     'estimation': ('model',),
-    'drivers': ('model', 'bags.values'),
+    'drivers': ('model', 'bags.messages'),
     'sim': ('model', 'drivers.mavlink'),     # framing of the emulated board
     'supervisor': ('model', 'control.base', 'control.registry', 'estimation.inputs'),
     'bags': ('model', 'control.base', 'control.registry', 'control.tasks'),

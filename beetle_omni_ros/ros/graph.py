@@ -22,7 +22,7 @@ import yaml
 
 import beetle_omni_ros
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.flight.plugin import component_class, node_name
+from beetle_omni_ros.flight.component import component_class, node_name
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 

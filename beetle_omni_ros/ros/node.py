@@ -10,10 +10,9 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from beetle_omni_ros.bags.messages import MessageError
 from beetle_omni_ros.bags.topics import topic_of
-from beetle_omni_ros.bags.values import MessageError
-from beetle_omni_ros.flight.component import Component, DIAGNOSTICS_PERIOD
-from beetle_omni_ros.flight.plugin import node_name
+from beetle_omni_ros.flight.component import Component, DIAGNOSTICS_PERIOD, node_name
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import parameter
 from beetle_omni_ros.ros import parameters, wire

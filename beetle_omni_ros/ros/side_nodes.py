@@ -6,11 +6,11 @@ import sys
 from rcl_interfaces.srv import SetParameters
 
 from beetle_omni_ros.bags.bag_writer import BagWriter, FRAMES, FrameWriter
-from beetle_omni_ros.bags.topics import ALL, LATCHED_LOG, LOG, SENSOR, topics_with
+from beetle_omni_ros.bags.topics import LATCHED_LOG, LOG, SENSOR, topics_with
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.component import Component, ERROR, OK, WARN
-from beetle_omni_ros.flight.reference import Reference
+from beetle_omni_ros.flight.surroundings import Reference
 from beetle_omni_ros.model.schema import parameter, RunError
 from beetle_omni_ros.ros import wire
 from beetle_omni_ros.ros.node import FlightNode
@@ -50,7 +50,7 @@ class RecorderNode(FlightNode):
         self._failure = None
         self._received = []     # (topic, type, CDR, time of receipt [s]) not yet written
         prefix = self.get_namespace().rstrip('/') + '/'
-        for name, topic in {**ALL, **topics}.items():
+        for name, topic in topics.items():
             wire.subscribe_raw(self, name, partial(self._keep, prefix + name, topic.type),
                                LATCHED_LOG if topic.qos.latched else LOG, self._on_lost)
         self.create_subscription(wire.message_class(LINE), '/rosout', partial(

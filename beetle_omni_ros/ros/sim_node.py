@@ -11,7 +11,7 @@ from beetle_omni_ros.bags.conversions import set_time
 from beetle_omni_ros.bags.topics import SENSOR
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.flight.component import OK, WARN
-from beetle_omni_ros.flight.simulated import SimulatedRobot
+from beetle_omni_ros.flight.surroundings import SimulatedRobot
 from beetle_omni_ros.model.schema import group, parameter, ParameterError, RunError
 from beetle_omni_ros.ros import wire
 from beetle_omni_ros.ros.node import FlightNode

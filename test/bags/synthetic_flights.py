@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from beetle_omni_ros.bags.values import Diagnostic, Wrench
+from beetle_omni_ros.bags.messages import Diagnostic, Wrench
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.body import BodyState

@@ -12,7 +12,7 @@ from check_helpers import QUICK, repeated
 import serial
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.bags.values import Diagnostic
+from beetle_omni_ros.bags.messages import Diagnostic
 from beetle_omni_ros.drivers.check import run_check
 from beetle_omni_ros.drivers.findings import ObservedGraph
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard

@@ -63,8 +63,8 @@ def loses_one_node_after_another(graph, witness, bag):
     graph.kill('recorder_node')
     assert witness.stays_in_the_air(0.5)
     log = read_bag(bag)
-    assert killed_at - 0.6 < log.imu_t[-1] < killed_at + 0.1
-    assert len(log.imu_t) > 400 and len(log.command_t) > 100 and log.targets
+    assert killed_at - 0.6 < log.imu.t[-1] < killed_at + 0.1
+    assert len(log.imu.t) > 400 and len(log.command.t) > 100 and log.targets
 
     graph.kill('reference_node')
     assert witness.stays_in_the_air(0.5)
@@ -201,4 +201,4 @@ def test_a_full_disk_ends_the_flight_with_one_line_and_the_bag_is_readable(tmp_p
     assert done.returncode == 1
     assert done.stderr == f'beetle_omni fly: error: {bag}: File too large\n'
     assert len(done.stdout.splitlines()) == 1       # how to watch it
-    assert len(read_bag(bag).truth_t) > 100
+    assert len(read_bag(bag).truth.t) > 100

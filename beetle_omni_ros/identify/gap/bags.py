@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.bags.bag import BagError, read_together
-from beetle_omni_ros.bags.bag_types import from_bytes, read_all
-from beetle_omni_ros.bags.topics import TOPICS
+from beetle_omni_ros.bags.bag import BagError, read_all, read_together
+from beetle_omni_ros.bags.messages import from_bytes
+from beetle_omni_ros.bags.topics import ALL
 from beetle_omni_ros.model.parameters import JOINT_NAMES, ROTOR_NAMES
 
 # Topic -> columns of its table; PARTS: fields of the message that they come from.
@@ -64,7 +64,7 @@ def read_recording(path: str | Path) -> Recording:
             known.add(name)
             if name not in PARTS and name != 'supervisor/state':
                 continue
-            if messages.type != TOPICS[name].type:
+            if messages.type != ALL[name].type:
                 bad[name] = bad.get(name, 0) + count
             elif name in PARTS:
                 data[name] += messages.data
@@ -73,11 +73,10 @@ def read_recording(path: str | Path) -> Recording:
                 _note(states, messages)
     times, values, received = {}, {}, {}
     for name, width in {**NEEDED, **OPTIONAL}.items():
-        rows, value, refused = read_all(TOPICS[name], data[name])
-        parts = () if value is None else [getattr(value, part) for part in PARTS[name]]
-        times[name] = np.zeros(0) if value is None else value.stamp
-        values[name] = np.column_stack([np.zeros((len(rows), 0)), *parts]) if len(rows) \
-            else np.zeros((0, width))
+        rows, read, refused = read_all(ALL[name], data[name])
+        times[name] = np.array([value.stamp for value in read], dtype=float)
+        values[name] = np.column_stack([[getattr(value, part) for value in read]
+                                        for part in PARTS[name]]) if read else np.zeros((0, width))
         received[name] = np.concatenate([np.zeros(0), *when[name]])[rows]
         if refused:
             bad[name] = bad.get(name, 0) + refused.total()
@@ -104,7 +103,7 @@ def _check_members(path, data, times):
         return
     for name in named:
         try:
-            others = from_bytes(data[name][0], TOPICS[name].type).name
+            others = from_bytes(data[name][0], ALL[name].type).name
         except Exception:       # a message that cannot be decoded
             continue
         if others and not {*JOINT_NAMES, *ROTOR_NAMES} & set(others):
