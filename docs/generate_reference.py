@@ -297,8 +297,7 @@ def _acts(entry) -> str:
     ways = {'body': 'the body equations', 'servo': 'the servo equation',
             'number': 'a number of the robot file', 'command': 'the delay of commands',
             'sensor': 'readings', 'feedback': 'readings of the encoders', 'play': 'play'}
-    both = ' and the servo equation' if entry.kind == 'body' and entry.servo else ''
-    return ways[entry.kind] + both
+    return ways[entry.kind]
 
 
 def _neutral(value) -> str:

@@ -13,8 +13,7 @@ from beetle_omni_ros.model.terms import Effect, EffectParameter, NAN
 
 UP = ca.DM([0, 0, 1])
 REFERENCE_HEIGHT = 0.25     # [m] of the rotor, for which the gain of the ground effect is given
-EXPONENTIAL_HEIGHT = 0.25   # [m] over which the exponential form falls to 1/e
-LEAST_HEIGHT = 0.08         # [m] below which the forms are not valid
+LEAST_HEIGHT = 0.08         # [m] below which the law is not valid
 NO_JOINTS = 'the filter does not read the joints'
 # Terms that the simulated plant and the gap finder have -> why NMPC and training leave out an
 # effect of them.
@@ -102,13 +101,12 @@ def translational_lift(terms, per_rotor):
     terms.thrust = terms.thrust + ca.vertcat(*gain)
 
 
-def tilt_thrust_loss(terms, loss_at_60deg, cosine_share=0.0):
-    sine, cosine = ca.sin(terms.tilt), ca.cos(terms.tilt)
-    shape = (1 - cosine_share) * sine * sine / 0.75 + cosine_share * 2 * (1 - cosine)
-    terms.thrust = terms.thrust * (1 - loss_at_60deg * shape)
+def tilt_thrust_loss(terms, loss_at_60deg):
+    sine = ca.sin(terms.tilt)
+    terms.thrust = terms.thrust * (1 - loss_at_60deg * (sine * sine / 0.75))
 
 
-def ground_effect(terms, exponential_share=0.0, **values):
+def ground_effect(terms, **values):
     if terms.position is None:
         return
     scale = []
@@ -117,24 +115,17 @@ def ground_effect(terms, exponential_share=0.0, **values):
                          LEAST_HEIGHT)
         upright = (terms.rotation @ terms.thrust_directions[i])[2]
         ratio = REFERENCE_HEIGHT / height
-        shape = (1 - exponential_share) * ratio * ratio + exponential_share * ca.exp(
-            (REFERENCE_HEIGHT - height) / EXPONENTIAL_HEIGHT)
-        scale.append(1 + values['gain_at_0.25m'] * shape * upright * upright)
+        scale.append(1 + values['gain_at_0.25m'] * ratio * ratio * upright * upright)
     terms.thrust = terms.thrust * ca.vertcat(*scale)
 
 
-def gyroscopic_load(servo, joint, angular_momentum_at_hover, spin_up_share=1.0, joint_share=0.0):
-    servo.load = servo.load + joint_share * angular_momentum_at_hover * servo.gyroscopic
-
-
-def propeller_gyroscopic_torque(terms, angular_momentum_at_hover, spin_up_share=1.0,
-                                 joint_share=0.0):
+def propeller_gyroscopic_torque(terms, angular_momentum_at_hover):
     speeds = terms.rotor_speeds()
     for i in range(4):
         momentum = angular_momentum_at_hover * terms.spin[i] * speeds[i]
         turning = terms.angular_velocity + terms.tilt_rate[i] * terms.tilt_axes[i]
         terms.torque = terms.torque - momentum * ca.cross(turning, terms.thrust_directions[i])
-    rotor_acceleration_torque(terms, spin_up_share * angular_momentum_at_hover)
+    rotor_acceleration_torque(terms, angular_momentum_at_hover)
 
 
 def rotor_acceleration_torque(terms, angular_momentum_at_hover):
@@ -180,10 +171,6 @@ def _number(key, unit, low, high, **more):
     return EffectParameter(unit, NAN, low, high, number=key, **more)
 
 
-def _form(neutral):
-    return EffectParameter('1', neutral, 0.0, 1.0, default=neutral, form=True)
-
-
 # In order of application: the true tilt first, because it changes the thrust directions.
 CATALOGUE: dict[str, Effect] = {
     'joint_offset': Effect(
@@ -219,10 +206,9 @@ CATALOGUE: dict[str, Effect] = {
             'rotors.torque_to_thrust_ratio', 'm', 0.0, 0.2)},
         'tau_i = -spin_i ratio f_i about the thrust axis', sets('torque_ratio'), allocated=True),
     'ground_effect': Effect(
-        'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0),
-                 'exponential_share': _form(0.0)},
-        'f_i (1 + g s(h) n_z^2), s = (0.25 m / h)^2 after Cheeseman and Bennett 1955, or '
-        'exp((0.25 m - h) / 0.25 m); h: rotor above the floor', ground_effect),
+        'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0)},
+        'f_i (1 + g (0.25 m / h)^2 n_z^2) after Cheeseman and Bennett 1955; h: rotor above the '
+        'floor', ground_effect),
     'rotor_drag': Effect(
         'body', {'coefficient': EffectParameter('N s/m', 0.0, 0.0, 5.0)},
         'H-force of Faessler et al. 2018, in the rotor plane, grows with rotor speed '
@@ -244,18 +230,16 @@ CATALOGUE: dict[str, Effect] = {
         'f_i + k |v_in_plane|^2: induced velocity falls with the flow through the disc '
         '(Leishman 2006, ch. 2)', translational_lift),
     'tilt_thrust_loss': Effect(
-        'body', {'loss_at_60deg': EffectParameter('1', 0.0, 0.0, 0.9), 'cosine_share': _form(0.0)},
-        'f_i (1 - L s(q)), s = sin^2 q / 0.75 or 2 (1 - cos q): arm and body in the wake',
+        'body', {'loss_at_60deg': EffectParameter('1', 0.0, 0.0, 0.9)},
+        'f_i (1 - L sin^2 q / 0.75): arm and body in the wake',
         tilt_thrust_loss),
     'wind': Effect(
         'body', {'force': EffectParameter('N', (0.0,) * 3, -100, 100)},
         'constant force in world', wind, allocated=True),
     'propeller_gyroscopic_torque': Effect(
-        'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0),
-                 'spin_up_share': _form(1.0), 'joint_share': _form(0.0)},
-        "-(w + q' e) x h s n - h' s n with h ~ sqrt(f): the propellers' angular momentum; the "
-        'part about the tilt axis loads the servo where joint_share is 1',
-        propeller_gyroscopic_torque, gyroscopic_load),
+        'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0)},
+        "-(w + q' e) x h s n - h' s n with h ~ sqrt(f): the propellers' angular momentum",
+        propeller_gyroscopic_torque),
     'rotor_acceleration_torque': Effect(
         'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0)},
         "-h' s n with h ~ sqrt(f): a change of rotor speed turns the body",
@@ -293,7 +277,7 @@ CATALOGUE: dict[str, Effect] = {
         'smooth over 0.05 rad/s in the model', servo=joint_friction),
     'joint_backlash': Effect(
         'joint', {'gap': EffectParameter('rad', 0.0, 0.0, 0.3, of_each=True),
-                  'at_encoder': _form(0.0)},
+                  'at_encoder': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
         'play of width gap between motor and rotor; the encoder is on the side of the motor, with '
         'at_encoder 1 on that of the rotor'),
     'joint_deflection': Effect(

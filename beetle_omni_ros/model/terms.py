@@ -66,7 +66,6 @@ class ServoTerms:
 
     target: Any             # commanded angle [rad]
     thrust: Any = 0.0       # of the joint's rotor [N]
-    gyroscopic: Any = 0.0   # load for each N m s of the rotor's momentum in hover [rad/s]
     load: Any = 0.0         # torque beside the motor's [N m]
     coulomb: Any = None     # sliding friction [N m]
     stiction: Any = None    # friction at rest [N m]

@@ -11,12 +11,7 @@ from typing import Any
 import numpy as np
 
 from beetle_omni_ros.model import dynamics, native, rotations
-from beetle_omni_ros.model.effects import (
-    CATALOGUE,
-    EXPONENTIAL_HEIGHT,
-    LEAST_HEIGHT,
-    REFERENCE_HEIGHT,
-)
+from beetle_omni_ros.model.effects import CATALOGUE, LEAST_HEIGHT, REFERENCE_HEIGHT
 from beetle_omni_ros.model.parameters import RobotParameters
 
 # Effects that only change a number of the plant's bodies, rotors and reaction torques.
@@ -133,30 +128,27 @@ def translational_lift(at, per_rotor):
     at.thrust = at.thrust + per_rotor * (squared - at.along()**2)
 
 
-def tilt_thrust_loss(at, loss_at_60deg, cosine_share):
-    """Thrust (1 - L s(q)), s by sin^2 q or 1 - cos q, each 1 at 60 deg."""
-    shape = (1 - cosine_share) * (1 - np.cos(2 * at.tilt)) / 1.5 \
-        + cosine_share * 4 * np.sin(0.5 * at.tilt)**2
-    at.thrust = at.thrust * (1 - loss_at_60deg * shape)
+def tilt_thrust_loss(at, loss_at_60deg):
+    """Thrust (1 - L s(q)), s by sin^2 q, 1 at 60 deg."""
+    at.thrust = at.thrust * (1 - loss_at_60deg * (1 - np.cos(2 * at.tilt)) / 1.5)
 
 
-def ground_effect(at, exponential_share, **gain):
+def ground_effect(at, **gain):
     """Thrust by the height of the rotor (Cheeseman and Bennett 1955)."""
     up = at.rotation[2]     # world's z axis in base_link
     height = np.maximum(at.position[2] + at.rotors.positions.dot(up), LEAST_HEIGHT)
-    shape = (1 - exponential_share) * (REFERENCE_HEIGHT / height)**2 \
-        + exponential_share * np.exp((REFERENCE_HEIGHT - height) / EXPONENTIAL_HEIGHT)
-    at.thrust = at.thrust * (1 + gain['gain_at_0.25m'] * shape * at.normals.dot(up)**2)
+    at.thrust = at.thrust * (1 + gain['gain_at_0.25m'] * (
+        REFERENCE_HEIGHT / height * at.normals.dot(up))**2)
 
 
-def propeller_gyroscopic_torque(at, angular_momentum_at_hover, spin_up_share, joint_share):
+def propeller_gyroscopic_torque(at, angular_momentum_at_hover):
     """Torque -dH/dt of the propellers' angular momentum H, seen in an inertial frame."""
     # H = sum h n turns with the body and with the joints
     turned = directions(at.sideways, at.tilt + 0.5 * np.pi)     # derivative of n by the tilt
     momentum = angular_momentum_at_hover * at.rotors.spin * at.speeds()
     at.torque = at.torque - rotations.cross(at.rate, momentum.dot(at.normals)) \
         - (momentum * at.tilt_rate).dot(turned)
-    rotor_acceleration_torque(at, spin_up_share * angular_momentum_at_hover)
+    rotor_acceleration_torque(at, angular_momentum_at_hover)
 
 
 def rotor_acceleration_torque(at, angular_momentum_at_hover):
@@ -241,24 +233,15 @@ class ServoLoads:
         self._robot = robot
         names = {name for name in robot.effects
                  if CATALOGUE[name].servo and name != 'joint_friction'}
-        self._from_model = bool(names - {'joint_deflection', 'propeller_gyroscopic_torque'})
-        self._deflection = np.array(robot.effect('joint_deflection.deflection_per_newton', 0.0))
-        share, momentum = (robot.effect(f'propeller_gyroscopic_torque.{name}', 0.0)
-                           for name in ('joint_share', 'angular_momentum_at_hover'))
-        self._momentum = share * momentum * robot.rotors.spin
-        self._sideways = np.cross(robot.tilt_axes, [0.0, 0.0, 1.0])
-        self.active = bool(self._from_model or self._deflection.any() or self._momentum.any())
+        self._from_model = bool(names - {'joint_deflection'})
+        self._deflection = robot.effect('joint_deflection.deflection_per_newton', 0.0)
+        self.active = bool(names)
 
-    def __call__(self, commanded: np.ndarray, tilt: np.ndarray, rate: np.ndarray,
-                 thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Targets [rad] and torques [N m] (4,) at the body's ``rate`` [rad/s] and true thrusts."""
+    def __call__(self, commanded: np.ndarray, thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Targets [rad] and torques [N m] (4,) at the true thrusts [N]."""
         if self._from_model:
-            terms = [dynamics.tilt_servo(
-                self._robot, i, commanded[i], thrust[i],
-                float(dynamics.gyroscopic_load(self._robot, rate, tilt[i], thrust[i], i)))[1]
-                for i in range(4)]
+            terms = [dynamics.tilt_servo(self._robot, i, commanded[i], thrust[i])[1]
+                     for i in range(4)]
             return (np.array([each.target for each in terms], dtype=float),
                     np.array([each.load for each in terms], dtype=float))
-        turned = directions(self._sideways, tilt + 0.5 * np.pi)
-        speeds = np.sqrt(np.maximum(thrust, 0.0) / self._robot.hover_thrust)
-        return commanded + self._deflection * thrust, self._momentum * speeds * turned.dot(rate)
+        return commanded + self._deflection * thrust, np.zeros(4)

@@ -246,8 +246,7 @@ class Plant:
 
     def _load_servos(self):
         """Set servo targets and joint torques from the commands by the effects on servos."""
-        self._target[:], load = self._loads(self._commanded_tilt, self._tilt, self._qvel[3:6],
-                                            self._scale * self.data.act)
+        self._target[:], load = self._loads(self._commanded_tilt, self._scale * self.data.act)
         self.data.qfrc_applied[6:] = load + self._friction
 
     def _rub(self, others):

@@ -11,7 +11,6 @@ from beetle_omni_ros.identify.gap.residual import starts_of
 from beetle_omni_ros.identify.gap.servo import (
     module_load,
     simulate,
-    spin_load,
     undescribed_load,
     Windows,
 )
@@ -145,17 +144,6 @@ def test_play_behind_the_encoder_turns_the_true_tilt_only():
     assert 0.008 < apart.max() < 0.011
 
 
-def test_the_gyroscopic_load_on_a_joint_agrees_with_euler():
-    """Turning the angular momentum needs a torque, which the servo gives about its axis."""
-    made = model(MOTION.flight())
-    load, t = spin_load(made.signals, {}), made.signals.t
-    speed = np.sqrt(MOTION.thrust / (ROBOT.mass * ROBOT.gravity / 4))
-    for i, axis in enumerate(ROBOT.tilt_axes):
-        momentum = ROBOT.rotors.spin[i] * speed[:, i:i + 1] * MOTION.normals[:, i]
-        expected = -np.cross(MOTION.rate, momentum) @ axis
-        assert np.allclose(load[:, i], np.interp(t, MOTION.t, expected), atol=5e-3)
-
-
 def test_a_torque_limit_is_recovered_from_samples_at_the_limit():
     made, key = model(flight(servo(effort=0.05))), 'joint_torque_limit.effort_limit'
     begin = starts_of(KEYS[key], [made])
@@ -189,7 +177,7 @@ def test_undescribed_modules_load_joints_as_described_ones_of_equal_moment_and_i
 def test_a_servo_sags_under_a_module_that_hangs_beside_its_axis(sets, base, moment):
     k, gravity = 800, 9.8
     zero, one = np.zeros((k, 1, 4)), np.ones((k, 1, 4))
-    windows = Windows(zero[0], zero[0], zero, zero, zero, P.servo_step, 0, 8,
+    windows = Windows(zero[0], zero[0], zero, zero, P.servo_step, 0, 8,
                       (gravity * one, zero))
     robot = replace(ROBOT, effects={'module_reaction': {'module_inertia': 0.0,
                                                         'mass_moment': base}})

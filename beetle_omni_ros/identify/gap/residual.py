@@ -18,7 +18,6 @@ from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.servo import (
     module_load,
     simulate,
-    spin_load,
     targets_at,
     undescribed_load,
     Windows,
@@ -190,10 +189,10 @@ class FlightModel:
         at = self._starts - round(p.servo_warm_up / p.grid)
         middle = edges[:, :-1] + p.servo_step / 2
         index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
-        loads = (s.thrust({})[0], module_load(s, theta), spin_load(s, theta),
+        loads = (s.thrust({})[0], module_load(s, theta),
                  *undescribed_load(s, theta))
-        force, load, spin, *more = (series[index].transpose(1, 0, 2) for series in loads)
-        return Windows(tilt[at], rate[at], force, load, spin, p.servo_step, skip,
+        force, load, *more = (series[index].transpose(1, 0, 2) for series in loads)
+        return Windows(tilt[at], rate[at], force, load, p.servo_step, skip,
                        round(p.grid / p.servo_step), tuple(more)), edges
 
 

@@ -98,6 +98,7 @@ TREATMENTS: dict[str, Treatment] = {
         ('mass', 'imu_misalignment', 'mocap_misalignment'),
         'hover at yaw 0 and 180 deg; fan off'),
     'propeller_gyroscopic_torque': Treatment(
+        # its part about the tilt axes loads the servos, which the model leaves out
         {'angular_momentum_at_hover': Size(0.066, 0.008, step=5e-3)},
         'fast turns and fast tilting', ('inertia', 'rotor_acceleration_torque', 'rotor_lag'),
         'fast tilting by internal force at rest', 'BJ'),
