@@ -1,11 +1,13 @@
 """
 Forces that effects add to the simulated plant, from the equations of their sources.
 
-They are written in numpy and share no code with the CasADi model of :mod:`robot.effects`, so that
+They are written in numpy and share no code with the CasADi model of :mod:`model.effects`, so that
 an error in one of the two shows as a difference, see ``test/sim/test_agreement.py``. The thrust of
 an effect is the one that the effects before it in the catalogue leave.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ import numpy as np
 from beetle_omni_ros.model import dynamics, native, rotations
 from beetle_omni_ros.model.effects import CATALOGUE, LEAST_HEIGHT, REFERENCE_HEIGHT
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.parts import RotorParameters
 
 # Effects that only change a number of the plant's bodies, rotors and reaction torques.
 BUILT_IN = ('mass', 'inertia', 'centre_of_mass', 'module_reaction', 'thrust_coefficient',
@@ -21,58 +24,47 @@ ONES = np.ones(4)
 LEAST_SPEED = 0.1       # [1] of a rotor, relative to hover, for the rate of its angular momentum
 
 
+@dataclass
 class Instant:
     """
     The rotors and the air at one instant; effects change thrust, forces and torque in place.
 
     Rows of (4, 3) arrays are rotors, vectors are in base_link unless stated otherwise.
-
-    Attributes:
-        rotation: (3, 3) body to world; ``position`` and ``velocity`` in world [m], [m/s];
-            ``rate`` of the body [rad/s].
-        tilt, tilt_rate: (4,) of the rotors [rad], [rad/s].
-        normals: (4, 3) thrust directions.
-        thrust, thrust_rate: (4,) [N], [N/s].
-        force_world: (3,) added force in world [N].
-        force: (4, 3) added at the rotors [N]; 0.0: none.
-        torque: (3,) added [N m].
-
     """
 
-    rotation: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    rate: np.ndarray
-    tilt: np.ndarray
-    tilt_rate: np.ndarray
-    thrust: np.ndarray
-    thrust_rate: np.ndarray
-    voltage_ratio: float
+    rotors: RotorParameters
+    hover_thrust: float         # of each rotor [N]
+    sideways: np.ndarray        # (4, 3) thrust directions at tilts of 90 deg
+    rotation: np.ndarray        # (3, 3) body to world
+    position: np.ndarray        # (3,) in world [m]
+    velocity: np.ndarray        # (3,) in world [m/s]
+    rate: np.ndarray            # (3,) of the body [rad/s]
+    tilt: np.ndarray            # (4,) [rad]
+    tilt_rate: np.ndarray       # (4,) [rad/s]
+    thrust: np.ndarray          # (4,) [N]
+    thrust_rate: np.ndarray     # (4,) [N/s]
+    voltage_ratio: float        # of the pack over that of a full one
+    force_world: Any = 0.0      # (3,) added, in world [N]; 0.0: none, as the next two
+    force: Any = 0.0            # (4, 3) added at the rotors [N]
+    torque: Any = 0.0           # (3,) added [N m]
 
-    def __init__(self, robot: RobotParameters, sideways: np.ndarray, **motion: Any):
-        vars(self).update(motion)
-        self.rotors, self.hover_thrust = robot.rotors, robot.hover_thrust
-        self.force_world: Any = 0.0
-        self.force: Any = 0.0
-        self.torque: Any = 0.0
-        self.sideways = sideways
-        self.normals = directions(sideways, self.tilt)
-        self._hubs: np.ndarray | None = None
+    def __post_init__(self):
+        """Set the thrust directions (4, 3)."""
+        self.normals = directions(self.sideways, self.tilt)
 
     def speeds(self) -> np.ndarray:
         """(4,) rotor speeds relative to hover: thrust grows with the square of the speed."""
         return np.sqrt(np.maximum(self.thrust, 0.0) / self.hover_thrust)
 
+    @cached_property
     def hubs(self) -> np.ndarray:
         """(4, 3) velocities of the hubs through still air [m/s]."""
-        if self._hubs is None:
-            self._hubs = self.velocity.dot(self.rotation) \
-                - self.rotors.positions.dot(rotations.skew(self.rate))    # w x r
-        return self._hubs
+        return self.velocity.dot(self.rotation) \
+            - self.rotors.positions.dot(rotations.skew(self.rate))    # w x r
 
     def along(self) -> np.ndarray:
         """(4,) velocities of the hubs along the thrust directions [m/s]."""
-        return np.einsum('ij,ij->i', self.hubs(), self.normals)
+        return np.einsum('ij,ij->i', self.hubs, self.normals)
 
 
 def directions(sideways: np.ndarray, tilt: np.ndarray) -> np.ndarray:
@@ -107,14 +99,14 @@ def body_drag(at, coefficient):
 
 def rotor_drag(at, coefficient):
     """H-force, against the velocity in the plane of the rotor (Faessler et al. 2018)."""
-    in_plane = at.hubs() - at.along()[:, None] * at.normals
+    in_plane = at.hubs - at.along()[:, None] * at.normals
     at.force = at.force - (0.25 * coefficient * at.speeds())[:, None] * in_plane
 
 
 def rotor_hub_moment(at, coefficient):
     """Moment -k s n x v of a disc that tilts back (Leishman 2006, ch. 4)."""
     at.torque = at.torque - 0.25 * coefficient * axial(
-        (at.speeds()[:, None] * at.normals).T.dot(at.hubs()))
+        (at.speeds()[:, None] * at.normals).T.dot(at.hubs))
 
 
 def axial_inflow(at, per_rotor):
@@ -124,7 +116,7 @@ def axial_inflow(at, per_rotor):
 
 def translational_lift(at, per_rotor):
     """Thrust k |v|^2 by the flow along the disc (Leishman 2006, ch. 2)."""
-    squared = np.einsum('ij,ij->i', at.hubs(), at.hubs())
+    squared = np.einsum('ij,ij->i', at.hubs, at.hubs)
     at.thrust = at.thrust + per_rotor * (squared - at.along()**2)
 
 
@@ -199,7 +191,8 @@ class AddedForces:
         ``driven`` are the motors' angles (4,) [rad], ``motion`` the fields of :class:`Instant`
         without the rotation.
         """
-        at = Instant(self._robot, self._sideways, rotation=rotations.matrix(quaternion), **motion)
+        at = Instant(self._robot.rotors, self._robot.hover_thrust, self._sideways,
+                     rotations.matrix(quaternion), **motion)
         thrust, normals = at.thrust, at.normals
         if self._has_play:
             normals = directions(self._sideways, driven)

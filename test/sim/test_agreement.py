@@ -2,7 +2,7 @@
 The plant, in MuJoCo and numpy, and the CasADi model agree; each has its own equations.
 
 Each effect is compared but for the friction of the servos, whose law both take from
-:mod:`robot.servo`, and ``module_reaction``: there the plant has bodies and the model approximates
+:mod:`model.servo`, and ``module_reaction``: there the plant has bodies and the model approximates
 them (``benchmarks/multibody_difference.py`` has the difference).
 """
 
