@@ -7,14 +7,14 @@ from flights import KEYS, model, Motion, P, ROBOT, solved, STEP
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.residual import starts_of
-from beetle_omni_ros.identify.gap.servo import (
+from beetle_omni_ros.identify.flights.bag_flight import starts_of
+from beetle_omni_ros.identify.flights.servo import (
     module_load,
     simulate,
     undescribed_load,
     Windows,
 )
-from beetle_omni_ros.identify.gap.signals import Signals
+from beetle_omni_ros.identify.flights.signals import Signals
 from beetle_omni_ros.model.parameters import RobotParameters
 
 MOTION = Motion(9, 12.0)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from beetle_omni_ros.identify.gap.treatment import TREATMENTS
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.model.effects import CATALOGUE
 
 # layer -> names of its effects, with those of their parameters that are fixed
