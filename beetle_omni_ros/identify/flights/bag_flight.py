@@ -20,12 +20,12 @@ from beetle_omni_ros.identify.flights.keys import delays_of, Key
 from beetle_omni_ros.identify.flights.servo import (
     module_load,
     simulate,
-    spin_load,
     undescribed_load,
     Windows,
 )
 from beetle_omni_ros.identify.flights.signals import Signals
 from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.recording.bag import COMMAND, Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.identify.recording.series import low_pass, matrices, THIN, within
@@ -352,22 +352,24 @@ class BagFlight:
         at = self._starts - round(p.servo_warm_up / p.grid)
         middle = edges[:, :-1] + p.servo_step / 2
         index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
-        loads = (s.thrust({})[0], module_load(s, theta), spin_load(s, theta),
-                 *undescribed_load(s, theta))
-        force, load, spin, *more = (series[index].transpose(1, 0, 2) for series in loads)
-        return Windows(tilt[at], rate[at], force, load, spin, p.servo_step, skip,
+        loads = (s.thrust({})[0], module_load(s, theta), *undescribed_load(s, theta))
+        force, load, *more = (series[index].transpose(1, 0, 2) for series in loads)
+        return Windows(tilt[at], rate[at], force, load, p.servo_step, skip,
                        round(p.grid / p.servo_step), tuple(more)), edges
 
 
-def limit_starts(key, effect, models):
-    """Starts at which a limit begins to act in these flights."""
-    what, below = effect.limit
+def starts_of(key, models):
+    """Starts of an effect without a slope; of a limit, where it begins to act in these flights."""
+    treatment = TREATMENTS[key.effect]
+    if treatment.limit is None:
+        return treatment.starts
+    what, below = treatment.limit
     most = max(float({
         'tilt_rate': lambda m: np.abs(m.signals.joints({})[1]).max(),
         'torque': lambda m: np.quantile(np.abs(_torques(m)), 0.999),
         'thrust': lambda m: np.quantile(m.flight.values[COMMAND][:, 4:], 0.999)}[what](m))
         for m in models)
-    return tuple((float(np.log(part * most / key.base)),) for part, in effect.starts
+    return tuple((float(np.log(part * most / key.base)),) for part, in treatment.starts
                  if part * most < below * key.base)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.identify.flights.bag_flight import BagFlight, limit_starts
+from beetle_omni_ros.identify.flights.bag_flight import BagFlight, starts_of
 from beetle_omni_ros.identify.flights.balance import Balance, SLOW
 from beetle_omni_ros.identify.flights.body import BodyModel, swing_of, tilting_modules
 from beetle_omni_ros.identify.flights.engine import Engine
@@ -30,6 +30,7 @@ from beetle_omni_ros.identify.flights.quality import explained
 from beetle_omni_ros.identify.flights.results import ALPHA, concluded, result_of
 from beetle_omni_ros.identify.flights.signals import IMU_LAG
 from beetle_omni_ros.identify.flights.table_flight import COMPARED, GROUPS, TableFlight
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.recording.bag import Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.identify.recording.table import Format, read_flight
@@ -81,7 +82,7 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
         name, moved = start.partition('@')[0], [f'{start}~{key}' for key in own]
         spreads[start] = Spread(0.03, 1.0, 0.0)
         spreads |= {tangent: Spread(0.001, 0.3, 0.0) for tangent in moved}
-        entries.append(Entry(name, (start, *moved), None, CATALOGUE[name].channels == 'B'))
+        entries.append(Entry(name, (start, *moved), None, TREATMENTS[name].channels == 'B'))
     bounds |= dict.fromkeys(starts, (0.0, np.inf)) | kept
     varying = {n: VARYING[n.partition('[')[0]] for n in spreads if n.partition('[')[0] in VARYING}
     if len(models) > 1:
@@ -126,10 +127,8 @@ def _starts(keys, models):
     """Name of a start -> deviations of the keys of its effect."""
     result = {}
     for name in LIMITS:
-        effect = CATALOGUE[name]
         own = [key for key in keys.values() if key.effect == name and not key.form]
-        values = limit_starts(own[0], effect, models) if effect.limit else effect.starts
-        for k, start in enumerate(values):
+        for k, start in enumerate(starts_of(own[0], models)):
             result[f'{name}@{k}'] = dict(zip([key.name for key in own], start, strict=True))
     return result
 
