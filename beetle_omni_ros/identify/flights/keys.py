@@ -187,7 +187,7 @@ def extra_keys() -> dict[str, Key]:
 
 
 @dataclass(frozen=True)
-class Spread:
+class Prior:
     """Prior standard deviations of one key: narrow, of a candidate, between flights."""
 
     narrow: float
@@ -226,7 +226,7 @@ def keys_of(robot: RobotParameters, names: set[str]) -> dict[str, Key]:
             if key.effect in names and not key.form}
 
 
-def spread(robot: RobotParameters, key: Key, tolerance: float, stamps: float) -> Spread:
+def prior_of(robot: RobotParameters, key: Key, tolerance: float, stamps: float) -> Prior:
     """Priors of a key; ``tolerance`` of robots (0: none), ``stamps`` of a clock [s]."""
     unit = CATALOGUE[key.effect].parameters[key.parameter].unit
     size = 1.0 if key.relative else size_of(robot, unit)
@@ -239,7 +239,7 @@ def spread(robot: RobotParameters, key: Key, tolerance: float, stamps: float) ->
         flight = max(flight, stamps)
     typical = AIR * TREATMENTS['rotor_drag'].sizes['coefficient'].typical if (
         plain == 'wind.force') else key.typical
-    return Spread(tolerance or 0.5 * key.smallest * size, typical * size, flight)
+    return Prior(tolerance or 0.5 * key.smallest * size, typical * size, flight)
 
 
 def entries_of(keys: dict[str, Key]) -> list[Entry]:
