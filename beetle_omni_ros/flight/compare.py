@@ -181,7 +181,6 @@ FLIGHTS = '.flights'  # default folder of finished flights, in the output folder
 def run_compare(*, output: Path, controllers: list[str] | None = None,
                 tasks: list[str] | None = None, conditions: list[str] | None = None,
                 seeds: list[int] | None = None, jobs: int | None = None,
-                backend: str = 'processes', address: str | None = None,
                 cache: Path | None = None, policy: Path | None = None,
                 plant: Path | None = None, json_path: Path | None = None,
                 console: Console | None = None) -> dict:
@@ -211,7 +210,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
     try:
         output.mkdir(parents=True, exist_ok=True)
         made = sweep(fly_flight, [(flight, flight.make_task()) for flight in flights],
-                     store=store, backend=backend, jobs=jobs, address=address, console=console,
+                     store=store, jobs=jobs, console=console,
                      line=lambda flight, result, kept: f'{flight.name}: ' + (
                          result['failure'] or ('kept' if kept else f"{result['cpu_s']:.0f} s")))
     except KeyboardInterrupt:

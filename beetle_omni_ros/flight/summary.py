@@ -20,6 +20,7 @@ from beetle_omni_ros.bags.metrics import at, CRASHED, failed, POSE_KEYS
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import PUSH_PERIOD, RISING, TILTS
 from beetle_omni_ros.show import table as published
+from beetle_omni_ros.show.figures import LINES
 
 # --- statistics ----------------------------------------------------------------------------------
 
@@ -127,11 +128,12 @@ def look(controller: str) -> Look:
     """Look of a controller, or of its published counterpart."""
     name = controller.removeprefix(PREFIX)
     entry = registry.SHIPPED.get(name)
+    line = LINES.get(name, (SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1))))
     if entry is None:
-        return Look(name, '', SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1)))
+        return Look(name, '', *line)
     if name != controller:
-        return Look(entry.label, 'the publication', entry.line[0], ':')
-    return Look(entry.label, entry.description, *entry.line)
+        return Look(entry.label, 'the publication', line[0], ':')
+    return Look(entry.label, entry.description, *line)
 
 
 def kind_of(task: str) -> str:
