@@ -5,7 +5,7 @@ A value is that of servos with the same gains in all logs. Its interval also cov
 differ between logs, because a log seldom separates bandwidth, damping and delay.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import hashlib
 from pathlib import Path
@@ -16,10 +16,9 @@ import numpy as np
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.identify.rotor.log import COLUMNS, EXPECTED, read_rotor_log, UntimedError
-from beetle_omni_ros.identify.servo.fit import decoded, Found, HIGH, LOW, STARTS, Trial
+from beetle_omni_ros.identify.servo.fit import decoded, Found, HIGH, LOW, ServoModel, STARTS
 from beetle_omni_ros.identify.servo.log import HEADER, is_bag, read_joint_log
-from beetle_omni_ros.identify.servo.model import INDEX
-from beetle_omni_ros.identify.servo.robot import catalogue_values, JOINTS, own_delay
+from beetle_omni_ros.identify.servo.model import catalogue_values, INDEX, JOINTS, own_delay
 from beetle_omni_ros.model.catalogue import settings
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.files import LogError
@@ -40,13 +39,16 @@ HEAD = """\
 """
 
 
-def read_logs(paths: Sequence[Path], rate: float | None) -> tuple[list, list, list[str]]:
+def read_logs(what: str, paths: Sequence[Path], columns: Mapping[str, tuple[str, float]],
+              rate: float | None) -> tuple[list, list, list[str]]:
     """
-    Read logs of joints and of rotors, recognised by their header.
+    Read logs of joints and of rotors.
 
     Args:
+        what: `joint` or `rotor`, the kind of all logs, or `robot`: the header decides.
         paths: CSV files, or bags with responses of the joints.
-        rate: rows a second of time series without times [Hz]; None: they are left out.
+        columns: of rotors, see :func:`chosen`.
+        rate: rows a second of time series without times [Hz]; None: `robot` leaves them out.
 
     Returns:
         logs of joints, logs of rotors, and sentences about logs that were left out.
@@ -57,17 +59,19 @@ def read_logs(paths: Sequence[Path], rate: float | None) -> tuple[list, list, li
     """
     joints, rotors, notes = [], [], []
     for path in paths:
-        if is_bag(path) or _names(path, r'q\d_rad'):
+        if what == 'joint' or what == 'robot' and (is_bag(path) or _names(path, r'q\d_rad')):
             joints.append(read_joint_log(path))
-        elif path.is_file() and not _names(path, r'(rotor\d+_)?({})'.format(
-                '|'.join(COLUMNS['thrust']))):
+            continue
+        thrust = r'(rotor\d+_)?({})'.format('|'.join(COLUMNS['thrust']))
+        if what == 'robot' and path.is_file() and not _names(path, thrust):
             raise LogError(f'{path}: expected the header of a log of joints ({HEADER}) or of a '
                            f'rotor ({EXPECTED})')
-        else:
-            try:
-                rotors.append(read_rotor_log(path, rate=rate))
-            except UntimedError as error:
-                notes.append(f'not used: {error}')
+        try:
+            rotors.append(read_rotor_log(path, columns, rate))
+        except UntimedError as error:
+            if what == 'rotor':
+                raise
+            notes.append(f'not used: {error}')
     return joints, rotors, notes
 
 
@@ -140,7 +144,7 @@ def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict
     return effects, intervals, origin
 
 
-def _entries(found: Found, trial: Trial, log: int | None, robot: RobotParameters, draws: int
+def _entries(found: Found, trial: ServoModel, log: int | None, robot: RobotParameters, draws: int
              ) -> dict[str, dict[str, np.ndarray]]:
     """
     Entries of a log, or of the mean of all logs (None): (joints, draws) values of each parameter.

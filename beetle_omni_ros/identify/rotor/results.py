@@ -7,10 +7,9 @@ import matplotlib
 import numpy as np
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.rotor.lag import fit_lag
-from beetle_omni_ros.identify.rotor.log import RotorLog
-from beetle_omni_ros.identify.rotor.surface import (
+from beetle_omni_ros.identify.rotor.fits import (
     estimate,
+    fit_lag,
     fit_surface,
     map_rows,
     Rows,
@@ -18,10 +17,11 @@ from beetle_omni_ros.identify.rotor.surface import (
     temperature_drift,
     torque_ratio,
 )
+from beetle_omni_ros.identify.rotor.log import RotorLog
 from beetle_omni_ros.model.files import LogError
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.show.figures import FAINT, INK, legend, panels, STYLE, svg
-from beetle_omni_ros.show.page import Grid, page, section
+from beetle_omni_ros.show.page import Grid, section
 
 LEVELS = (0.25, 0.5, 0.75, 1.0)     # of the largest duty, for which the ratio is listed
 QUANTITIES = {'thrust': 'N', 'torque': 'N_m'}
@@ -128,14 +128,7 @@ def grids(results: dict) -> list[Grid]:
         for name, one, unit, digits in rows if one and 'value' in one])]
 
 
-def rotor_page(model: RotorModel, robot: RobotParameters, results: dict) -> str:
-    """HTML page about an identification."""
-    notes = [f'verdict: {results["verdict"]}', *results['warnings']]
-    return page('Rotor', f'identified from {results["meta"]["log"]}', grids(results), notes,
-                rotor_sections(model, robot))
-
-
-def rotor_sections(model: RotorModel, robot: RobotParameters) -> list[str]:
+def sections(model: RotorModel, robot: RobotParameters) -> list[str]:
     """Sections with surfaces, residuals and lags."""
     with matplotlib.rc_context(STYLE):
         surfaces = [section(

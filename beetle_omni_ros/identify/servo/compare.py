@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bags.bag import BagError, read_messages
-from beetle_omni_ros.identify.flights.text import summary
+from beetle_omni_ros.identify.flights.page import grids as flight_grids
+from beetle_omni_ros.identify.flights.page import head, summary
 from beetle_omni_ros.identify.inference.hierarchy import WIDTH
 from beetle_omni_ros.identify.servo.fit import (
     decoded,
-    ENTRIES,
     error_rms,
     Found,
     mask,
     select,
     Servos,
 )
-from beetle_omni_ros.identify.servo.joint import identify, joint_results
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
-from beetle_omni_ros.identify.servo.model import INDEX, NAMES, with_encoder_errors
-from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
+from beetle_omni_ros.identify.servo.model import (
+    catalogue_values,
+    ENTRIES,
+    file_sets,
+    INDEX,
+    NAMES,
+    own_delay,
+    with_encoder_errors,
+)
+from beetle_omni_ros.identify.servo.results import grids, identify, joint_results, sections
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.show.page import page
 
 ALPHA = 0.05        # probability of a wrong name, if each entry has the same prior probability
 AS_WELL = 1.3       # ratio of held-out errors of a corrected file and of the log's best model
@@ -35,14 +43,14 @@ CERTAIN = np.log(len(NAMED) / ALPHA)    # [nat] gain of evidence of a named entr
 
 
 def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: RobotParameters,
-                       base: Path | None) -> tuple[dict, Found]:
+                       base: Path | None) -> tuple[dict, Callable[[], str]]:
     """
     Compare the first log with a robot file, and further ones and those of ``holdout`` with it.
 
     ``base`` is the path of the robot file, for the record.
 
     Returns:
-        results with the keys of flights, and the identified servos.
+        results with the keys of flights, and a function that makes their HTML page.
 
     Raises:
         LogError: unusable log.
@@ -59,7 +67,14 @@ def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: Rob
         'meta': {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                  'robot': str(base) if base else 'params/robot.yaml', 'version': __version__}}
     result['summary'] = summary(result)
-    return result, apart
+
+    def made_page() -> str:
+        tables = [*flight_grids(result),
+                  *grids(result | {'meta': {'validate': [other.name for other in others]}})]
+        return page('Tilt servos', f'{log.name} against the robot file', tables, result['text'],
+                    sections(apart, others, robot), head(result))
+
+    return result, made_page
 
 
 def is_joint_log(path: Path) -> bool:

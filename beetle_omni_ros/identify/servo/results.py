@@ -1,29 +1,42 @@
-"""`beetle_omni identify joint`: results of an identification as plain data."""
+"""Identification of servos from response logs: results as plain data, tables and figures."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import matplotlib
+from matplotlib.figure import Figure
 import numpy as np
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.inference.hierarchy import WIDTH
 from beetle_omni_ros.identify.servo.fit import (
-    ENTRIES,
     error_rms,
     Found,
-    LIMITS,
     LOGARITHMIC,
     mask,
+    rms,
     select,
+    ServoModel,
     Servos,
-    Trial,
 )
-from beetle_omni_ros.identify.servo.log import JointLog
-from beetle_omni_ros.identify.servo.model import INDEX, NAMES, TERMS
-from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, held
+from beetle_omni_ros.identify.servo.log import FITTED, JointLog
+from beetle_omni_ros.identify.servo.model import (
+    ENTRIES,
+    file_sets,
+    held,
+    INDEX,
+    LIMITS,
+    NAMES,
+    simulate,
+    TERMS,
+)
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.show.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
+from beetle_omni_ros.show.page import Grid, section
 
+MILLI = 1e3
+SMALL = {'s': 'm', 'rad': 'm'}      # unit -> prefix in tables
 # Gains, delay, friction and a zero, which every servo has, ...
 SERVO = 'joint_bandwidth', 'joint_command_latency', 'joint_friction', 'joint_offset'
 # ... and the gain of a line. Without it, the damping takes up an error of 1 % of the amplitude of
@@ -47,7 +60,7 @@ def identify(logs: Sequence[JointLog], robot: RobotParameters, as_file: bool = F
     return select(Servos(logs, file_sets(robot, flown=True), as_file), always, allowed)
 
 
-def interval(found: Found, trial: Trial, unit: int, name: str) -> tuple[float, float]:
+def interval(found: Found, trial: ServoModel, unit: int, name: str) -> tuple[float, float]:
     """95 % interval of a term of a unit; open for a limit that the logs did not reach."""
     p = INDEX[name]
     log = found.servos.logs[found.servos.units[unit][0]]
@@ -92,11 +105,7 @@ def left_out_rms(found: Found, unit: int) -> tuple[float, float]:
     servo = read[joint] - s.logs[k].measured[joint, rows] + moved[np.arange(len(rows)), block]
     line = [Line(s.logs[k], joint, rows[block != b]).errors(s.logs[k], joint, rows[block == b])
             for b in np.unique(block)]
-    return _rms(servo), _rms(np.concatenate(line))
-
-
-def _rms(values):
-    return float(np.sqrt(np.mean(values**2)))
+    return rms(servo), rms(np.concatenate(line))
 
 
 def joint_results(found: Found, validations: Sequence[JointLog], robot: RobotParameters) -> dict:
@@ -120,13 +129,13 @@ def _joint(found, unit, validations, robot):
     best = 'servo' if apart[0] <= apart[1] else 'line'
 
     def of_line(other, k, part=slice(None)):
-        return _rms(line.errors(other, k, np.arange(len(other.t))[part][other.fresh[part]]))
+        return rms(line.errors(other, k, np.arange(len(other.t))[part][other.fresh[part]]))
 
     def predicted(other, k, part=slice(None)):
         return error_rms(other, k, values, part=part) if best == 'servo' else of_line(
             other, k, part)
 
-    derived, traded = catalogue_values(values, robot), inseparable(found, unit)
+    traded = inseparable(found, unit)
     return {
         'joint': number, 'best': best,
         'left_out_rms_rad': dict(zip(('servo', 'line'), apart, strict=True)),
@@ -142,10 +151,7 @@ def _joint(found, unit, validations, robot):
         'published_validation_rms_rad': [
             None if k is None else error_rms(other, k, file, is_held) for other, k in known],
         'terms': _terms(found, unit), 'traded': traded,
-        'text': sentences(found, unit, traded, best),
-        'derived': {'kp_N_m_per_rad': derived['joint_bandwidth']['kp'],
-                    'kd_N_m_s_per_rad': derived['joint_bandwidth']['kd'],
-                    'coulomb_friction_N_m': derived['joint_friction']['coulomb']}}
+        'text': sentences(found, unit, traded, best)}
 
 
 def _terms(found, unit):
@@ -204,3 +210,88 @@ def _merged(joints):
             about.setdefault(text, []).append(str(joint['joint']))
     return [f'Joint{"s" if len(numbers) > 1 else ""} {", ".join(numbers)}: {text}'
             for text, numbers in about.items()]
+
+
+def grids(results: dict) -> list[Grid]:
+    """Errors, range of motion and terms of the model, a column for each joint."""
+    joints = results['joints']
+    header = ['', *(f'joint {joint["joint"]}' for joint in joints)]
+    rows = [(text, [joint[key] for joint in joints]) for text, key in (
+        ('robot file, whole log', 'published_rms_rad'),
+        ('robot file, held-out part', 'published_heldout_rms_rad'),
+        ('identified, fitted part', 'fit_rms_rad'),
+        ('identified, held-out part', 'heldout_rms_rad'))]
+    rows.append(('line (gain, offset, delay), held-out part',
+                 [joint['line']['heldout_rms_rad'] for joint in joints]))
+    rows += [(f'{text}, {name}', [joint[f'{key}_rms_rad'][k] for joint in joints])
+             for k, name in enumerate(results['meta']['validate'])
+             for text, key in (('robot file', 'published_validation'),
+                               ('identified', 'validation'))]
+    errors = Grid('Prediction error, RMS [mrad]', header, [
+        [text, *('absent' if value is None else f'{MILLI * value:.2f}' for value in values)]
+        for text, values in rows])
+    motion = Grid('Motion of the fitted part, for which the model holds', header, [
+        [text, *('{:.3g}..{:.3g}'.format(*joint['holds_for'][key]) for joint in joints)]
+        for text, key in (('angle [rad]', 'angle_rad'), ('rate [rad/s]', 'rate_rad_s'),
+                          ('acceleration [rad/s^2]', 'acceleration_rad_s2'))])
+    return [errors, motion, Grid('Terms with 95 % interval', header, [
+        [f'{name} [{SMALL.get(term["unit"], "") + term["unit"]}]',
+         *(_value(joint['terms'][name]) for joint in joints)]
+        for name, term in joints[0]['terms'].items() if term['kept']])]
+
+
+def _value(term):
+    factor = MILLI if term['unit'] in SMALL else 1.0
+    numbers = [None if v is None else factor * v for v in (term['value'], *term['interval'])]
+    value, low, high = ('inf' if v is None else f'{v:.{digits}g}' if abs(v) < 99.5 else f'{v:.0f}'
+                        for v, digits in zip(numbers, (3, 2, 2), strict=True))
+    return f'{value},\n{low}..{high}'      # two lines: four joints fit into 80 columns
+
+
+def flown_errors(logs: Sequence[JointLog], robots: dict[str, RobotParameters]) -> Grid:
+    """Errors of robots as the simulator flies them, behind its delays and with the logs' zeros."""
+    rows = []
+    for log in logs:
+        for name, robot in robots.items():
+            sets = file_sets(robot, flown=True)[np.array(log.joints) - 1]
+            error = simulate(log, np.arange(len(sets)), sets) - log.measured
+            rows.append([f'{log.name}, {name}', *(f'{MILLI * np.std(one[log.fresh]):.1f}'
+                                                  for one in error)])
+    return Grid('RMS error of the servos as simulated, without zeros [mrad]',
+                ['', *(f'joint {number}' for number in logs[0].joints)], rows)
+
+
+def sections(found: Found, others: Sequence[JointLog], robot: RobotParameters) -> list[str]:
+    """A section with responses and errors of each log."""
+    logs = found.servos.logs
+    models = dict(zip(logs[0].joints, found.values(), strict=False))     # of the first log
+    with matplotlib.rc_context(STYLE):
+        return [section(
+            other.name + (': fitted to the shaded part' if k < len(logs) else ': not fitted'),
+            'Left: command (grey) and measured position. Right: simulations of the robot file and '
+            'of the identified model minus measurement.',
+            svg(_figure(other, models, robot, k < len(logs)), other.name))
+            for k, other in enumerate([*logs, *others])]
+
+
+def _figure(log, models, robot, fitted) -> Figure:
+    pairs = [(k, number) for k, number in enumerate(log.joints) if number in models]
+    file, is_held = file_sets(robot), held(robot)
+    figure, axes = panels(len(pairs), 2, height=1.7, sharex=True)
+    t, read = log.t - log.t[0], log.read_t[log.fresh] - log.t[0]
+    for (left, right), (k, number) in zip(axes, pairs, strict=True):
+        left.plot(t, log.command[k], color=FAINT, lw=1.0)
+        left.plot(t, log.measured[k], color=INK, lw=1.4)
+        left.set_ylabel(f'joint {number} [rad]')
+        for values, hold, colour, name in ((file[number - 1], is_held, COLOURS[1], 'robot file'),
+                                           (models[number], True, COLOURS[0], 'identified')):
+            error = MILLI * (simulate(log, k, values[None], hold)[0] - log.measured[k])
+            right.plot(read, error[log.fresh], color=colour, lw=0.8, label=name)
+        right.set_ylabel('error [mrad]')
+        if fitted:
+            for axis in (left, right):
+                axis.axvspan(0, FITTED * t[-1], color='#eef3f8', lw=0)
+    for axis in axes[-1]:
+        axis.set_xlabel('time [s]')
+    legend(figure, axes[0, 1])
+    return figure

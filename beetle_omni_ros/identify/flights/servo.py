@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.keys import friction, MODULES
-from beetle_omni_ros.identify.gap.signals import Signals
+from beetle_omni_ros.identify.flights.keys import friction, MODULES
+from beetle_omni_ros.identify.flights.signals import Signals
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.servo import NUMPY, Servo, Step
@@ -46,13 +46,6 @@ class Windows:
     skip: int
     every: int
     undescribed: tuple[np.ndarray, ...] = ()
-
-
-def targets_at(signals: Signals, theta: dict[str, float], edges: np.ndarray) -> np.ndarray:
-    """(K, W, 4) mean delayed commands [rad] between the steps ``edges`` (W, K + 1) [s]."""
-    means = signals.tilt_targets(edges.ravel(), signals.delays(theta)[0])
-    # The mean from the end of a window to the next one is dropped.
-    return np.concatenate([means, means[-1:]]).reshape(*edges.shape, 4)[:, :-1].transpose(1, 0, 2)
 
 
 def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,

@@ -3,30 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
 from beetle_omni_ros.bags.bag import names_of, runs_in
-from beetle_omni_ros.identify.flights.bag_verdict import judged
-from beetle_omni_ros.identify.flights.page import gap_page
+from beetle_omni_ros.identify.flights.apply import write_corrected
+from beetle_omni_ros.identify.flights.page import gap_page, grids, headline
 from beetle_omni_ros.identify.flights.results import ALPHA, result_of
-from beetle_omni_ros.identify.flights.table import Format
-from beetle_omni_ros.identify.flights.table_verdict import judged_tables, load_tables
-from beetle_omni_ros.identify.flights.text import grids, headline
-from beetle_omni_ros.identify.gap.apply import write_corrected
-from beetle_omni_ros.identify.gap.bags import read_recording
-from beetle_omni_ros.identify.gap.ingest import (
+from beetle_omni_ros.identify.flights.verdict import judged, judged_tables, load_tables
+from beetle_omni_ros.identify.recording.bag import read_recording
+from beetle_omni_ros.identify.recording.flight import (
     check_apart,
     check_flights,
-    load_flight,
+    prepare,
     UnusableFlight,
 )
-from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.recording.parameters import GapParameters
+from beetle_omni_ros.identify.recording.table import Format
 from beetle_omni_ros.identify.robot_file import check_differs
 from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_log
-from beetle_omni_ros.identify.servo.page import gap_log_page
 from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
@@ -82,8 +80,8 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
     check_apart([*runs, *holdout])
     if form is None and any(is_joint_log(run) for run in runs):
         with console.status('comparing the servos'):
-            result, apart = analyse_joint_logs(runs, holdout, model, robot)
-        html = gap_log_page(apart, result, grids(result), model) if page else ''
+            result, made_page = analyse_joint_logs(runs, holdout, model, robot)
+        html = made_page() if page else ''
     else:
         # On small matrices, several threads only take more CPU time.
         with console.status('reading') as status, threadpool_limits(1):
@@ -114,14 +112,15 @@ def _bags(runs, holdout, robot, p, fix, alpha, progress):
     flights, errors = [], []
     for path, name in zip(given, names_of(given), strict=True):
         try:
-            flights.append(load_flight(path, robot, p, fix, name))
+            flights.append(prepare(replace(read_recording(path), name=name), robot, p, fix))
         except UnusableFlight as error:
             errors.append(error)
     if errors:
         # A verdict from the other flights would be read as one from all of them.
+        damages = [damage for error in errors for damage in error.problems]
         return result_of('bad_data', {}, str(errors[0]), bad_data=[
-            {'run': d.run, 'topic': d.topic, 'cause': d.cause, 'at_s': d.at_s, 'sure': d.sure,
-             'fix': d.fix} for error in errors for d in error.problems])
+            {key: getattr(damage, key) for key in ('run', 'topic', 'cause', 'at_s', 'sure', 'fix')}
+            for damage in damages])
     check_flights(given, flights, p.same_flight)
     fitted, judging = flights[:len(runs)], flights[len(runs):]
     if not judging and len(fitted) > LEAST_FITTED:
