@@ -18,9 +18,8 @@ from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight.component import Component, ERROR, IDENTITY, OK, WARN
 from beetle_omni_ros.model.mode import FALLBACK, FLYING, STOPPED
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.supervisor.events import Answer, Event, INFO
-from beetle_omni_ros.supervisor.events import ERROR as SEVERE
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import Answer, Event, INFO, SupervisorParameters
+from beetle_omni_ros.supervisor.interface import ERROR as SEVERE
 from beetle_omni_ros.supervisor.supervisor import Supervisor
 
 # --- estimator -----------------------------------------------------------------------------------

@@ -15,10 +15,16 @@ from beetle_omni_ros.model.allocation import ActuatorHealth, Allocator, ROTORS
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.readings import SpikeFilter
 from beetle_omni_ros.supervisor.backup import BackupEstimator
-from beetle_omni_ros.supervisor.commands import CommandStream, FROZEN, JUMP, SAME
+from beetle_omni_ros.supervisor.commands import (
+    CommandStream,
+    FROZEN,
+    JUMP,
+    Lateness,
+    SAME,
+    Silence,
+)
 from beetle_omni_ros.supervisor.detectors import FaultWatch
-from beetle_omni_ros.supervisor.events import Event, INFO, Lateness, Silence, WARNING
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import Event, INFO, SupervisorParameters, WARNING
 from beetle_omni_ros.supervisor.way import inclination
 
 TICK_LIMIT = 0.02       # [s] a longer pause of the supervisor counts as this for the sources

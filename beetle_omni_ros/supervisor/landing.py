@@ -8,8 +8,8 @@ from beetle_omni_ros.control.base import Command, Fallback, State, TrajectoryTar
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.allocation import Allocator
 from beetle_omni_ros.model.degraded import FLYING_MARGIN, Holding
-from beetle_omni_ros.supervisor.events import ERROR
 from beetle_omni_ros.supervisor.inputs import Inputs
+from beetle_omni_ros.supervisor.interface import ERROR
 from beetle_omni_ros.supervisor.way import climb, coasted, halting, inclination, plan, Ramp, Way
 from beetle_omni_ros.supervisor.wrench import NEAR_GROUND
 

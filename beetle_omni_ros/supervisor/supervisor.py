@@ -15,6 +15,7 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, Fallback, PoseTarget, Target
 from beetle_omni_ros.model.allocation import ALL_HEALTHY, clipped, NO_ZEROS, ROTORS
 from beetle_omni_ros.model.mode import (
+    COMMAND_AGE,
     DISARMED,
     FALLBACK,
     FLYING,
@@ -27,14 +28,12 @@ from beetle_omni_ros.model.mode import (
 )
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.supervisor.commands import within_limits
-from beetle_omni_ros.supervisor.events import Answer, ERROR, INFO, WARNING
 from beetle_omni_ros.supervisor.inputs import ARM_TILT, Inputs
+from beetle_omni_ros.supervisor.interface import Answer, ERROR, INFO, SupervisorParameters, WARNING
 from beetle_omni_ros.supervisor.landing import Landing, Takeoff
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
 from beetle_omni_ros.supervisor.way import coasted, halting, inclination
 from beetle_omni_ros.supervisor.wrench import NEAR_GROUND
 
-AGE_LIMIT = 0.1         # [s] no older command is sent; the actuators have the same limit
 STOP_TIME = 0.3         # [s] zero thrust is sent for this time, then nothing
 HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
 TILT_RATE = 9.0         # [rad/s] as in hover.yaml: below the servos' 10
@@ -202,7 +201,7 @@ class Supervisor(Inputs):
         contact, poses = self.watch.contact.reason, self.backup.poses
         flies = self.state == FLYING or self._in_state < LATE_TIME
         self.watch.paused = self.ages.partly or flies and self.streams[self.active].ages.partly
-        if paused > AGE_LIMIT:
+        if paused > COMMAND_AGE:
             self.watch.name('supervisor_paused', now)
             self.watch.restart()
             self._resumed = now

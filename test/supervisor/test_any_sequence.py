@@ -6,7 +6,7 @@ import numpy as np
 from vehicle_rig import flown, LEVEL, ROBOT, VehicleRig
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.supervisor.supervisor import AGE_LIMIT
+from beetle_omni_ros.model.mode import COMMAND_AGE
 
 RUBBISH = [np.nan, np.inf, -np.inf, 1e300, -1e9, 0.0, 1.0, 3.9, -4.1, 25.0, -0.5]
 numbers = st.one_of(st.sampled_from(RUBBISH), st.floats(-30, 30))
@@ -75,7 +75,7 @@ def watch(rig, command):
     assert command.tilt.shape == command.thrust.shape == (4,)
     assert np.abs(command.tilt).max() <= ROBOT.joints.position_limit
     assert command.thrust.min() >= 0 and command.thrust.max() <= ROBOT.rotors.thrust_max
-    assert supervisor._now - command.stamp <= AGE_LIMIT + 1e-9
+    assert supervisor._now - command.stamp <= COMMAND_AGE + 1e-9
     if supervisor.state in ('disarmed', 'emergency_stop'):
         assert not command.thrust.any()
 

@@ -9,7 +9,7 @@ from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.model.allocation import Allocator
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import SupervisorParameters
 from beetle_omni_ros.supervisor.supervisor import Supervisor
 
 ROBOT = RobotParameters.load()
