@@ -263,7 +263,8 @@ class FlightLoop(Loop):
                     self.start_faults()
                 if reference.state != state:
                     state = reference.state
-                    if simulator.battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
+                    inputs = self.supervisor.inputs
+                    if inputs.battery_low or simulator.battery.charge < SWAP_CHARGE:
                         simulator.battery.reset()
                 if progress and simulator.time - reported >= DIAGNOSTICS_PERIOD:
                     reported += DIAGNOSTICS_PERIOD

@@ -39,25 +39,26 @@ def perform(rig, action):
         rig.now += rest[0]
         supervisor.update(rig.now)
     elif kind == 'command':
-        supervisor.on_command(rest[0], Command(rig.now + rest[1], rest[2], rest[3]),
+        supervisor.inputs.on_command(rest[0], Command(rig.now + rest[1], rest[2], rest[3]),
                               rig.now)
     elif kind == 'spoil':
         # One wrong number in a new, otherwise good command.
         values = np.concatenate([np.zeros(4), np.full(4, ROBOT.hover_thrust)])
         values[rest[1]] = rest[0]
-        supervisor.on_command(supervisor.active, Command(rig.now + 0.01, values[:4],
+        supervisor.inputs.on_command(supervisor.active, Command(rig.now + 0.01, values[:4],
                                                          values[4:]), rig.now)
     elif kind == 'state':
-        supervisor.on_state(State(rig.now + rest[0], rest[1][:3], rest[2][:3], LEVEL, rest[3][:3],
-                                  rest[3], rest[2], rig.now + rest[0]))
+        supervisor.inputs.on_state(State(
+            rig.now + rest[0], rest[1][:3], rest[2][:3], LEVEL, rest[3][:3], rest[3], rest[2],
+            rig.now + rest[0]))
     elif kind == 'raw':
-        supervisor.on_imu(rig.now + rest[0], rest[1][:3], rest[2][:3])
-        supervisor.on_mocap(rig.now + rest[0], rest[1][:3], rest[2])
-        supervisor.on_joints(rig.now + rest[0], rest[1], rest[2])
+        supervisor.inputs.on_imu(rig.now + rest[0], rest[1][:3], rest[2][:3])
+        supervisor.inputs.on_mocap(rig.now + rest[0], rest[1][:3], rest[2])
+        supervisor.inputs.on_joints(rig.now + rest[0], rest[1], rest[2])
     elif kind == 'battery':
-        supervisor.on_battery(rest[0])
+        supervisor.inputs.on_battery(rest[0])
     elif kind == 'bridge':
-        supervisor.on_actuators(*rest, rig.now)
+        supervisor.inputs.on_actuators(*rest, rig.now)
     elif kind == 'toggle':
         rig.alive ^= {rest[0]}
     elif rest[0] in ('nmpc', 'rl', 'x'):
@@ -75,7 +76,7 @@ def watch(rig, command):
     assert command.tilt.shape == command.thrust.shape == (4,)
     assert np.abs(command.tilt).max() <= ROBOT.joints.position_limit
     assert command.thrust.min() >= 0 and command.thrust.max() <= ROBOT.rotors.thrust_max
-    assert supervisor._now - command.stamp <= COMMAND_AGE + 1e-9
+    assert supervisor.inputs._now - command.stamp <= COMMAND_AGE + 1e-9
     if supervisor.state in ('disarmed', 'emergency_stop'):
         assert not command.thrust.any()
 
