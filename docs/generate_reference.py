@@ -47,7 +47,7 @@ FILES = {
                           'The policy of train_published.yaml.'),
     'hover.yaml': ('control.hover:HoverParameters', 'The hover controller.'),
     'ekf.yaml': ('estimation.parameters:EkfParameters', 'The estimator.'),
-    'supervisor.yaml': ('supervisor.parameters:SupervisorParameters',
+    'supervisor.yaml': ('supervisor.interface:SupervisorParameters',
                         'Checks of commands, takeoff, landing, detection of faults.'),
     'targets.yaml': ('control.targets:TargetLimits', 'What a target pose must keep to.'),
     'drive.yaml': ('ros.drive:DriveParameters', 'Driving by hand.'),
