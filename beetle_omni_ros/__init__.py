@@ -158,7 +158,7 @@ def find_gap(runs: Sequence[str | Path], holdout: Sequence[str | Path] = (), *,
     """
     from rich.console import Console
 
-    from beetle_omni_ros.identify.gap.command import gap_results
+    from beetle_omni_ros.identify.flights.command import gap_results
     return gap_results(list(map(_path, runs)), list(map(_path, holdout)), _path(robot),
                        _path(apply), None, _path(report), Console(quiet=quiet), form=form)
 

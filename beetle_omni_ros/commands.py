@@ -286,7 +286,7 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
 
     Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
     """
-    from beetle_omni_ros.identify.gap.command import run_gap
+    from beetle_omni_ros.identify.flights.command import run_gap
     return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
                    tolerances=tolerances, form=form, alpha=alpha)
 

@@ -23,7 +23,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from beetle_omni_ros.identify.gap.apply import effects_with
+from beetle_omni_ros.identify.flights.apply import effects_with
 from beetle_omni_ros.identify.servo import compare as servo_compare
 from beetle_omni_ros.identify.servo.compare import compare, gap_of
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log

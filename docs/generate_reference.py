@@ -55,14 +55,14 @@ FILES = {
     'motor_board.yaml': ('drivers.device_parameters:MotorBoardParameters',
                          'The motor board.'),
     'simulator.yaml': ('sim.parameters:SimulatorParameters', 'The simulated world.'),
-    'recording.yaml': ('identify.recording.limits:RecordingLimits',
+    'recording.yaml': ('identify.recording.parameters:RecordingLimits',
                        'Limits of the checks of a recording against itself.'),
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
     'train_any.yaml': ('train.parameters:TrainParameters',
                        'The training for robots that differ.'),
     'train_published.yaml': ('train.parameters:TrainParameters',
                              'The training with the settings of the publication.'),
-    'gap.yaml': ('identify.gap.parameters:GapParameters', 'The gap finder.')}
+    'gap.yaml': ('identify.recording.parameters:GapParameters', 'The gap finder.')}
 
 ROBOT_FILE = """`mass`, `inertia` and `rotors.positions` are authoritative. With `multibody`, the
 simulated main body is what modules and end-effector leave of them. A file that extends another

@@ -38,7 +38,8 @@ ALLOWED = {
 # Library -> the only subpackage that imports it.
 KEPT_IN = {'mujoco': 'sim', 'rclpy': 'ros', 'launch': 'ros', 'torch': 'train',
            'rsl_rl': 'train', 'tensordict': 'train', 'dynamixel_sdk': 'drivers',
-           'pymavlink': 'drivers', 'serial': 'drivers', 'viser': 'show', 'trimesh': 'show'}
+           'pymavlink': 'drivers', 'serial': 'drivers', 'gymnasium': 'flight', 'viser': 'show',
+           'trimesh': 'show'}
 
 
 def imports(path):

@@ -258,27 +258,27 @@ def find_all(references: Iterable[str]) -> list[ControllerEntry]:
     return list(entries.values())
 
 
-def loaded(reference: str) -> Any:
+def loaded(reference: str, what: str = 'controller') -> Any:
     """Import ``package.module:Name`` or ``path/to/file.py:Name``, also from the working folder."""
     place, _, name = reference.rpartition(':')
     if not place or not name.isidentifier():
-        raise ParameterError(f"controller '{reference}': expected {CLASS}")
+        raise ParameterError(f"{what} '{reference}': expected {CLASS}")
     if place.endswith('.py') and not Path(place).is_file():
-        raise ParameterError(f"controller '{reference}': no such file")
+        raise ParameterError(f"{what} '{reference}': no such file")
     folder = str(Path(place).parent if place.endswith('.py') else Path.cwd())
     if folder not in sys.path:
         sys.path.append(folder)
     try:
         module = _executed(Path(place)) if place.endswith('.py') else import_module(place)
     except ModuleNotFoundError as error:
-        raise ParameterError(f"controller '{reference}': no module '{error.name}'") from None
+        raise ParameterError(f"{what} '{reference}': no module '{error.name}'") from None
     except Exception as error:
-        raise ParameterError(f"controller '{reference}': importing {place} raised "
+        raise ParameterError(f"{what} '{reference}': importing {place} raised "
                              f'{error_text(error)}') from error
     if not hasattr(module, name):
         there = [key for key, value in vars(module).items() if inspect.isclass(value)
                  and value.__module__ == module.__name__]
-        raise ParameterError(f"controller '{reference}': no '{name}' in {place}; its classes: "
+        raise ParameterError(f"{what} '{reference}': no '{name}' in {place}; its classes: "
                              f"{', '.join(there) or 'none'}")
     return getattr(module, name)
 

@@ -370,7 +370,7 @@ def component_class(reference: str) -> type[Component]:
         ParameterError: there is none at ``reference``, 'FILE.py:Class' or 'package.module:Class'.
 
     """
-    kind = loaded(reference)
+    kind = loaded(reference, 'component')
     if not (isinstance(kind, type) and issubclass(kind, Component)):
         raise ParameterError(f"component '{reference}': {kind!r} is no subclass of Component")
     return kind

@@ -57,13 +57,14 @@ def prepared(controller: str, *, robot: RobotParameters, plant: RobotParameters,
         from beetle_omni_ros.flight.real_time import EmulatedLoop  # has serial ports
         kind = EmulatedLoop
     with ExitStack() as stack:
+        others = made(components, robot)    # before the bag, which a mistake would leave behind
         recorders: list[Recorder] = [memory]
         if bag is not None:
             from beetle_omni_ros.bags.bag_writer import BagWriter
             recorders.append(stack.enter_context(BagWriter(
                 bag, meta=meta, topics=tuple(topics_with([entry.name])), frames=True)))
         loop = kind(robot, plant, aboard, Recorder(*recorders), conditions=conditions, seed=seed,
-                    faults=faults, epoch=int(time()), others=made(components, robot))
+                    faults=faults, epoch=int(time()), others=others)
         loop.recording = memory.log
         stack.pop_all()     # the loop closes its recorder
     return loop

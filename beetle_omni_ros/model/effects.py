@@ -330,14 +330,15 @@ CATALOGUE: dict[str, Effect] = {
         "-coulomb sgn(q') while sliding, up to stiction at rest (Armstrong-Helouvry 1994); "
         'smooth over 0.05 rad/s in the model', 'slow reversals of the tilts',
         ('joint_backlash', 'joint_bandwidth'), 'triangle of 2 deg at 0.1 Hz',
-        servo=joint_friction, channels='J', starts=((0.004, 0.004), (0.012, 0.015))),
+        servo=joint_friction, channels='J',
+        starts=((0.003, 0.003), (0.008, 0.008), (0.02, 0.02))),
     'joint_backlash': Effect(
         'joint', {'gap': EffectParameter('rad', 0.0, 0.0, 0.3, 0.01, 0.003, of_each=True),
                   'at_encoder': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
         'play of width gap between motor and rotor; the encoder is on the side of the motor, with '
         'at_encoder 1 on that of the rotor', 'reversals of the tilts',
         ('joint_friction', 'joint_feedback_delay'), 'reversals loaded and unloaded',
-        starts=((0.005,), (0.02,))),
+        starts=((0.005,), (0.02,), (0.05,))),
     'joint_deflection': Effect(
         'joint', {'deflection_per_newton': EffectParameter('rad/N', 0.0, -0.05, 0.05, 0.002,
                                                            0.0004, step=1e-4)},

@@ -9,7 +9,7 @@ from beetle_omni_ros.bags.bag_writer import BagWriter, FRAMES, FrameWriter
 from beetle_omni_ros.bags.topics import LATCHED_LOG, LOG, SENSOR, topics_with
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task
-from beetle_omni_ros.flight.component import Component, ERROR, OK, WARN
+from beetle_omni_ros.flight.component import Component, component_class, ERROR, OK, WARN
 from beetle_omni_ros.flight.surroundings import Reference
 from beetle_omni_ros.model.schema import parameter, RunError
 from beetle_omni_ros.ros import wire
@@ -42,7 +42,10 @@ class RecorderNode(FlightNode):
             'recorder_node',
             bag=parameter(doc='folder to create for the bag'),
             controllers=parameter(registry.STANDING_BY,
-                                  doc='registered controllers whose commands are recorded'))
+                                  doc='registered controllers whose commands are recorded'),
+            components=parameter((), doc='components whose topics are recorded: FILE.py:Class'))
+        for reference in self.parameters.components:
+            component_class(reference)      # its module registers its topics
         topics = topics_with(self.parameters.controllers)
         self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
                               topics=tuple(topics), frames=True)

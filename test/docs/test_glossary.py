@@ -13,8 +13,6 @@ TWICE = {
     'Register': 'address and size of the driver; storage of the emulated servo',
     'Reference': 'sample of a target; component that publishes targets',
     'Spread': 'prior of a fit of logs; prior of an entry in flights',
-    'Flight': 'recorded signals that gap compares; a graph that flies',
-    'Signals': 'common grid of a flight; readings that are compared in a recording',
     'Answer': 'of a request; of the actuators in the viewer'}
 
 

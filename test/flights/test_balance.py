@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 from test_engine import BESIDE, gap_of, motor_volts, ROBOT
 
 from beetle_omni_ros.identify.flights.balance import Balance, SCALES, SCATTER, SESSION, SLOW
-from beetle_omni_ros.identify.flights.priors import keys_of, spread
+from beetle_omni_ros.identify.flights.keys import keys_of, spread
 from beetle_omni_ros.model.parameters import RobotParameters
 
 HEADER = ('t,ekf_px,ekf_py,ekf_pz,ekf_vx,ekf_vy,ekf_vz,ekf_ax,ekf_ay,ekf_az,ekf_roll,ekf_yaw,'

@@ -7,15 +7,15 @@ from flights import KEYS, model, Motion, P, ROBOT, solved, STEP
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.residual import limit_starts
-from beetle_omni_ros.identify.gap.servo import (
+from beetle_omni_ros.identify.flights.bag_flight import limit_starts
+from beetle_omni_ros.identify.flights.servo import (
     module_load,
     simulate,
     spin_load,
     undescribed_load,
     Windows,
 )
-from beetle_omni_ros.identify.gap.signals import Signals
+from beetle_omni_ros.identify.flights.signals import Signals
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
 

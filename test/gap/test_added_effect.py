@@ -13,11 +13,10 @@ from test_consumers import OUTPUTS, plain, with_effect
 from test_ingest import recording
 
 import beetle_omni_ros
-from beetle_omni_ros.identify.flights.priors import entries_of
-from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.command import gap_results
-from beetle_omni_ros.identify.gap.ingest import prepare
-from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
+from beetle_omni_ros.identify.flights.body import BodyModel
+from beetle_omni_ros.identify.flights.command import gap_results
+from beetle_omni_ros.identify.flights.keys import all_keys, entries_of, extra_keys
+from beetle_omni_ros.identify.recording.flight import prepare
 from beetle_omni_ros.model import catalogue
 from beetle_omni_ros.model.effects import CATALOGUE
 
@@ -91,5 +90,5 @@ def test_the_charge_is_the_integral_of_the_current_since_the_first_message(curre
         values[10:20, 1] = np.nan
     flight = prepare(made, ROBOT, P)
     assert not flight.findings
-    expected = np.interp(flight.start + flight.battery_t, motion.t, motion.charge)
-    np.testing.assert_allclose(flight.battery[:, 1], expected, atol=1e-6)
+    expected = np.interp(flight.start + flight.times['battery_state'], motion.t, motion.charge)
+    np.testing.assert_allclose(flight.values['battery_state'][:, 1], expected, atol=1e-6)

@@ -12,7 +12,7 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc import NmpcParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.identify.gap.keys import number_of
+from beetle_omni_ros.identify.flights.keys import number_of
 from beetle_omni_ros.model import catalogue, dynamics
 from beetle_omni_ros.model.allocation import Allocator
 from beetle_omni_ros.model.effects import CATALOGUE

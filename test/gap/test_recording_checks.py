@@ -13,13 +13,11 @@ from scipy.signal import step as step_response
 from scipy.spatial.transform import Rotation, Slerp
 import yaml
 
-from beetle_omni_ros.identify.gap.bags import read_recording
-from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
-from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.recording.bag import changed, read_recording
 from beetle_omni_ros.identify.recording.check import checked
-from beetle_omni_ros.identify.recording.damage import changed
-from beetle_omni_ros.identify.recording.limits import RecordingLimits
-from beetle_omni_ros.identify.recording.readings import sensor_damages
+from beetle_omni_ros.identify.recording.flight import prepare, UnusableFlight
+from beetle_omni_ros.identify.recording.parameters import GapParameters, RecordingLimits
+from beetle_omni_ros.identify.recording.topics import sensor_damages
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import share_path
 

@@ -7,12 +7,12 @@ from gap_data.make import make_case
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.flights.bag import BagFlight
-from beetle_omni_ros.identify.flights.bag_verdict import judged
-from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.ingest import load_flight
-from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
-from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.flights.bag_flight import BagFlight
+from beetle_omni_ros.identify.flights.body import BodyModel
+from beetle_omni_ros.identify.flights.keys import all_keys, extra_keys
+from beetle_omni_ros.identify.flights.verdict import judged
+from beetle_omni_ros.identify.recording.flight import load_flight
+from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.model.parameters import RobotParameters
 
 P, ROBOT = GapParameters.load(), RobotParameters.load()

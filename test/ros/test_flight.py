@@ -26,6 +26,7 @@ from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.ros import fly as fly_module
 from beetle_omni_ros.ros.graph import Graph, in_simulated_time
 
+OBSERVER = f'{Path(__file__).parents[2]}/examples/own_component.py:WrenchObserver'
 NODES = ('recorder_node', 'sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node',
          'reference_node')
 
@@ -99,8 +100,9 @@ def flying(tmp_path):
     temporary.mkdir()
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros', 'fly', '--task', str(task), '--bag',
-         str(bag), '--alone', '--clock', 'simulated'], stderr=subprocess.PIPE,
-        stdout=subprocess.PIPE, text=True, env={**os.environ, 'TMPDIR': str(temporary)})
+         str(bag), '--alone', '--clock', 'simulated', '--component', OBSERVER],
+        stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, 'TMPDIR': str(temporary)})
     deadline = time.monotonic() + READY
     try:
         while not any(b'flying:nmpc' in file.read_bytes() for file in bag.glob('*.mcap')):
@@ -135,6 +137,7 @@ def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
     assert process.returncode == 130
     log = read_bag(bag)
     assert not log.warnings and log.states[-1] == 'flying:nmpc' and log.meta['interrupted']
+    assert any(b'/observer/force' in file.read_bytes() for file in bag.glob('*.mcap'))
     result = metrics(log, make_task(str(tmp_path / 'poses.csv')))
     assert not result['crashed'] and len(result['poses']) < 10
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from beetle_omni_ros.identify.flights.evidence import Posterior
-from beetle_omni_ros.identify.flights.priors import entries_of, keys_of, spread
+from beetle_omni_ros.identify.flights.keys import entries_of, keys_of, spread
 from beetle_omni_ros.model.parameters import RobotParameters
 
 SLOW = {'rotor_thrust_coefficient', 'rotor_hub_moment', 'centre_of_mass'}

@@ -9,9 +9,8 @@ from itertools import combinations
 import numpy as np
 
 from beetle_omni_ros.identify.flights.discrepancy import discrepancies
-from beetle_omni_ros.identify.flights.evidence import Judge, normal
-from beetle_omni_ros.identify.flights.priors import Entry, Spread
-from beetle_omni_ros.identify.flights.solution import log_prior, Solution
+from beetle_omni_ros.identify.flights.evidence import Judge, log_prior, normal, Solution
+from beetle_omni_ros.identify.flights.keys import Entry, Spread
 from beetle_omni_ros.identify.flights.spectrum import (
     EDGES,
     pooled,

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.identify.inference.hierarchy import design, solve, Spread, WIDTH
-from beetle_omni_ros.identify.inference.robust import consecutive, interval, jackknife, linear
+from beetle_omni_ros.identify.inference.noise import consecutive, interval, jackknife, linear
 from beetle_omni_ros.identify.rotor.log import LEAST_ROWS, RotorLog
 
 FORMS: tuple[tuple[tuple[int, int], ...], ...] = (

@@ -9,9 +9,8 @@ import numpy as np
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bags.bag import BagError, read_messages
-from beetle_omni_ros.identify.flights.page import head
-from beetle_omni_ros.identify.flights.text import grids as flight_grids
-from beetle_omni_ros.identify.flights.text import summary
+from beetle_omni_ros.identify.flights.page import grids as flight_grids
+from beetle_omni_ros.identify.flights.page import head, summary
 from beetle_omni_ros.identify.inference.hierarchy import WIDTH
 from beetle_omni_ros.identify.servo.fit import (
     decoded,

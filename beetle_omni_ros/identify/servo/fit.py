@@ -15,8 +15,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.stats import chi2
 
 from beetle_omni_ros.identify.inference.hierarchy import design, Fit, solve
-from beetle_omni_ros.identify.inference.noise import Drifting, drifting
-from beetle_omni_ros.identify.inference.robust import HUBER, scale_of
+from beetle_omni_ros.identify.inference.noise import Drifting, drifting, HUBER, scale_of
 from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.identify.servo.model import (
     ENTRIES,

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.keys import friction, MODULES
-from beetle_omni_ros.identify.gap.signals import Signals
+from beetle_omni_ros.identify.flights.keys import friction, MODULES
+from beetle_omni_ros.identify.flights.signals import Signals
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.servo import NUMPY, Servo, Step

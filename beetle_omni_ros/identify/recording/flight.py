@@ -1,7 +1,7 @@
 """From a recording to a checked flight, or the reason why it is unusable."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import replace
 import hashlib
 from pathlib import Path
 
@@ -9,17 +9,75 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from beetle_omni_ros.bags.bag import bag_files
-from beetle_omni_ros.identify.gap.bags import NEEDED, read_recording, Recording
-from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.series import aligned
+from beetle_omni_ros.identify.recording.bag import (
+    BATTERY,
+    changed,
+    COMMAND,
+    Damage,
+    IMU,
+    NEEDED,
+    POSE,
+    read_recording,
+    Recording,
+)
 from beetle_omni_ros.identify.recording.check import checked
-from beetle_omni_ros.identify.recording.clocks import begin_of
-from beetle_omni_ros.identify.recording.damage import changed, Damage
-from beetle_omni_ros.identify.recording.flown import flown
+from beetle_omni_ros.identify.recording.parameters import GapParameters, shipped
+from beetle_omni_ros.identify.recording.relations import THRUSTS
+from beetle_omni_ros.identify.recording.series import aligned
+from beetle_omni_ros.identify.recording.topics import begin_of
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
 TABLES = ('.csv', '.gz')     # endings of files that are no bags
+
+
+def flown(recording: Recording, robot: RobotParameters,
+          p: GapParameters) -> tuple[Recording, float] | None:
+    """
+    The longest flight of a recording; None if the robot does not fly.
+
+    Times of recording are used if they are known, because stamps and units may be damaged.
+
+    Returns:
+        the flight, with up to ``p.memory`` before it, and that time [s].
+
+    """
+    clock = {topic: recording.received.get(topic, t) for topic, t in recording.times.items()}
+    t, thrust = clock[COMMAND], recording.values[COMMAND][:, 4:].sum(axis=1)
+    weight = robot.mass * robot.gravity
+    level = max((thrust**2).sum() / max(thrust.sum(), 1e-9) / weight, 1e-9)
+    unit = min((1.0, *THRUSTS), key=lambda u: abs(np.log(level / u)))
+    lifted = np.flatnonzero(thrust > p.lifted * weight * min(unit, level))
+    if not len(lifted):
+        return None
+    # A short dip of the thrust is a descent.
+    landed = (np.diff(lifted) > 1) & (np.diff(t[lifted]) > p.settle)
+    pieces = np.split(lifted, np.flatnonzero(landed) + 1)
+    begin, end = t[max(pieces, key=lambda rows: t[rows[-1]] - t[rows[0]])][[0, -1]]
+    begin, end = _aloft(recording, clock[POSE], begin, end, p)
+    first = max(begin - p.memory, t[0])
+    if len(pieces) > 1:
+        recording = replace(recording, findings=[
+            *recording.findings, f'{recording.name}: {len(pieces)} flights, the longest is used'])
+    for topic, at in clock.items():
+        recording = changed(recording, topic, keep=(at >= first) & (at <= end))
+    return recording, float(begin - first)
+
+
+def _aloft(recording, when, begin, end, p):
+    """Times after take-off and before touchdown, as far as these were recorded."""
+    height, inside = recording.values[POSE][:, 2], (when > begin) & (when < end)
+    before, after = (height[rows] for rows in (when < begin - shipped().bin,
+                                               when > end + shipped().bin))
+    if len(after):
+        high = when[inside & (height > after[0] + shipped().risen)]
+        end = high[-1] if len(high) else end
+    if not len(before):
+        return begin, end
+    high = when[inside & (height > before[-1] + shipped().risen)]
+    begin = (high[0] if len(high) else begin) + p.settle
+    flying = [at for at, state in recording.states if state.startswith('flying') and at < end]
+    return max([begin, *flying[:1]]), end
 
 
 class UnusableFlight(ValueError):
@@ -36,43 +94,8 @@ class UnusableFlight(ValueError):
         self.problems = list(problems)
 
 
-@dataclass
-class Flight:
-    """
-    One contiguous piece of flight.
-
-    Attributes:
-        name: name of the recording.
-        start: stamp of its beginning [s]; all times below are relative to it.
-        duration: duration [s].
-        imu_t, imu: (N,) and (N, 6) specific force [m/s^2], rates [rad/s].
-        pose_t, pose: (N,) and (N, 7) position [m] and quaternion xyzw, sign-continuous.
-        joint_t, joint: (N,) and (N, 4) [rad].
-        command_t, command: (N,) and (N, 8) [rad], [N].
-        battery_t, battery: (N,) and (N, 2) voltage [V] and charge drawn since the first
-            message [A h], zero if no current is known; possibly empty.
-        findings: remarks of the checks.
-
-    """
-
-    name: str
-    start: float
-    duration: float
-    imu_t: np.ndarray
-    imu: np.ndarray
-    pose_t: np.ndarray
-    pose: np.ndarray
-    joint_t: np.ndarray
-    joint: np.ndarray
-    command_t: np.ndarray
-    command: np.ndarray
-    battery_t: np.ndarray
-    battery: np.ndarray
-    findings: list[str] = field(default_factory=list)
-
-
 def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
-                fix: bool = False, name: str = '') -> Flight:
+                fix: bool = False, name: str = '') -> Recording:
     """
     Read and check one recording.
 
@@ -90,7 +113,7 @@ def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
 
 
 def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
-            fix: bool = False) -> Flight:
+            fix: bool = False) -> Recording:
     """
     Check a recording and select the flight; see :func:`load_flight`.
 
@@ -107,36 +130,31 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
             Damage(name, topic, f'{len(recording.times[topic])} messages') for topic in missing])
     part = flown(_with_charge(recording), robot, p)
     if part is None:
-        raise _unusable(name, 'command', 'the robot does not fly: commanded thrust is never above '
+        raise _unusable(name, COMMAND, 'the robot does not fly: commanded thrust is never above '
                         f'{p.lifted:g} of its weight')
     origin = begin_of(recording)
     recording, lead = part
     recording, done, wrong = checked(recording, robot, origin, fix)
-    findings = [*recording.warnings, *done]
     if wrong:
         raise UnusableFlight(wrong[0].text, wrong)
+    findings = [*recording.findings, *done]
     series = {topic: _in_order(name, topic, recording, findings) for topic in recording.times}
-    t = series['command'][0]
-    begin, end = t[0] + lead, t[-1]
-    begin, end = _without_gaps(name, series, begin, end, p, findings, origin)
+    begin, end = _without_gaps(name, series, lead, p, findings, origin)
     if end - begin < p.least_duration:
         raise _unusable(name, 'all topics', f'{max(end - begin, 0.0):.1f} s of usable flight, '
                         f'{p.least_duration:.3g} s are needed')
-    cut = {}
-    for topic, (t, values) in series.items():
+    times, values = {}, {}
+    for topic, (t, rows) in series.items():
         keep = (t > begin - 1.0) & (t < end + 0.5)
-        cut[topic] = t[keep] - begin, values[keep]
-    pose = cut['mocap/pose'][1].copy()
+        times[topic], values[topic] = t[keep] - begin, rows[keep]
+    pose = values[POSE]
     norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     if abs(np.median(norm) - 1) > 0.01:
-        findings.append(f'{name}: mocap/pose: orientations of norm {np.median(norm):.3g}, '
+        findings.append(f'{name}: {POSE}: orientations of norm {np.median(norm):.3g}, '
                         'expected unit quaternions; normalised')
     pose[:, 3:] = aligned(pose[:, 3:] / np.where(norm > 1e-6, norm, 1.0))
-    flight = Flight(name, begin, end - begin, *cut['imu/data_raw'], cut['mocap/pose'][0], pose,
-                    *cut['joint_states'], *cut['command'], *cut['battery_state'],
-                    findings=findings)
-    _check_robot(flight, robot, p)
-    return flight
+    _check_robot(name, values, robot, p)
+    return Recording(name, times, values, findings=findings, start=begin, duration=end - begin)
 
 
 def _unusable(name, topic, cause, at_s=None):
@@ -163,22 +181,21 @@ def _in_order(name, topic, recording, findings):
 
 def _with_charge(recording):
     """The charge drawn since the first message [A h] in place of the current of either sign."""
-    t, (voltage, current) = recording.times['battery_state'], recording.values['battery_state'].T
+    t, (voltage, current) = recording.times[BATTERY], recording.values[BATTERY].T
     known = np.isfinite(t) & np.isfinite(current)
     at, rows = np.unique(t[known], return_index=True)
     drawn = np.zeros(len(t))
     if len(at) > 1:
         charge = cumulative_trapezoid(current[known][rows], at, initial=0) / 3600
         drawn = np.interp(t, at, np.abs(charge))
-    return changed(recording, 'battery_state', values=np.column_stack([voltage, drawn]))
+    return changed(recording, BATTERY, values=np.column_stack([voltage, drawn]))
 
 
-def _without_gaps(name, series, begin, end, p, findings, origin):
-    """The longest piece without a long gap in any topic."""
+def _without_gaps(name, series, lead, p, findings, origin):
+    """The longest piece without a long gap in any topic, from ``lead`` [s] after its begin on."""
     breaks, lost, longest = [], 0.0, (0.0, '', 0.0)
-    for topic in NEEDED:
-        t = series[topic][0]
-        begin, end = max(begin, t[0]), min(end, t[-1])
+    begin = max(series[COMMAND][0][0] + lead, *(series[topic][0][0] for topic in NEEDED))
+    end = min(series[topic][0][-1] for topic in NEEDED)
     for topic in NEEDED:
         t = series[topic][0]
         inside = t[(t >= begin) & (t <= end)]
@@ -196,16 +213,16 @@ def _without_gaps(name, series, begin, end, p, findings, origin):
     return max(pieces, key=lambda piece: piece[1] - piece[0])
 
 
-def _check_robot(flight, robot, p):
+def _check_robot(name, values, robot, p):
     """Refuse a flight of a completely different robot."""
-    total = np.median(np.linalg.norm(flight.imu[:, :3], axis=1))
+    total = np.median(np.linalg.norm(values[IMU][:, :3], axis=1))
     if total < 0.3 * robot.gravity:
-        raise _unusable(flight.name, 'imu/data_raw', f'specific force is {total:.2f} m/s^2, '
+        raise _unusable(name, IMU, f'specific force is {total:.2f} m/s^2, '
                         f'near {robot.gravity:.2f} m/s^2 expected')
-    commanded = np.median(flight.command[:, 4:].sum(axis=1)) / robot.mass
+    commanded = np.median(values[COMMAND][:, 4:].sum(axis=1)) / robot.mass
     # Thrusts may partly cancel each other, so only too small a sum is impossible.
     if commanded < (1 - p.wrong_robot) * total or commanded > 3 * total:
-        raise _unusable(flight.name, 'command', 'the robot file does not fit: commanded thrust '
+        raise _unusable(name, COMMAND, 'the robot file does not fit: commanded thrust '
                         f'over its mass is {commanded:.1f} m/s^2, the IMU measures '
                         f'{total:.1f} m/s^2')
 
@@ -233,7 +250,7 @@ def check_apart(runs: list[Path]) -> None:
         known[digest] = run
 
 
-def check_flights(runs: list[Path], flights: list[Flight], same: float) -> None:
+def check_flights(runs: list[Path], flights: list[Recording], same: float) -> None:
     """
     Refuse one flight in two different files: cut, converted or recorded twice.
 
@@ -243,7 +260,7 @@ def check_flights(runs: list[Path], flights: list[Flight], same: float) -> None:
         ParameterError: with both paths.
 
     """
-    readings = [{row.tobytes() for row in flight.imu} for flight in flights]
+    readings = [{row.tobytes() for row in flight.values[IMU]} for flight in flights]
     for k, own in enumerate(readings):
         for j in range(k):
             if len(own & readings[j]) > same * min(len(own), len(readings[j])):

@@ -1,8 +1,9 @@
-"""The measured topics of a bag as arrays, in the order of recording; needs no ROS."""
+"""Recordings of bags: measured topics as arrays, in the order of recording; their damages."""
 
 from collections import defaultdict
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from beetle_omni_ros.model.parameters import JOINT_NAMES, ROTOR_NAMES
 # Topic -> columns of its table; PARTS: fields of the message that they come from.
 NEEDED = {'imu/data_raw': 6, 'mocap/pose': 7, 'joint_states': 4, 'command': 8}
 OPTIONAL = {'battery_state': 2}
+IMU, POSE, JOINTS, COMMAND, BATTERY = *NEEDED, *OPTIONAL
 PARTS = {'imu/data_raw': ('specific_force', 'angular_velocity'),
          'mocap/pose': ('position', 'quaternion'), 'joint_states': ('position',),
          'command': ('tilt', 'thrust'), 'battery_state': ('voltage', 'current')}
@@ -23,16 +25,21 @@ PARTS = {'imu/data_raw': ('specific_force', 'angular_velocity'),
 @dataclass
 class Recording:
     """
-    Contents of one bag.
+    Contents of one bag, or one contiguous piece of flight.
 
     Attributes:
         name: name of the bag.
-        times: topic -> (N,) header stamps [s], in the order of recording.
-        values: topic -> (N, width): IMU specific force and rates, pose and quaternion xyzw, joint
-            positions, tilt and thrust commands, voltage and current.
+        times: topic -> (N,) header stamps [s], in the order of recording. Those of a flight are
+            relative to its start, ascending and unique.
+        values: topic -> (N, width): IMU specific force [m/s^2] and rates [rad/s], position [m] and
+            quaternion xyzw, joint positions [rad], tilt [rad] and thrust [N] commands, voltage [V]
+            and current [A]; of a flight, sign-continuous quaternions and, in place of the current,
+            the charge drawn since the first message [A h], zero if no current is known.
         states: (time of recording, supervisor state), if recorded.
-        warnings: problems while reading.
+        findings: remarks of reading and checks.
         received: topic -> (N,) times of recording [s]; empty if unknown.
+        start: stamp of the beginning of a flight [s].
+        duration: of a flight [s].
 
     """
 
@@ -40,8 +47,10 @@ class Recording:
     times: dict[str, np.ndarray]
     values: dict[str, np.ndarray]
     states: list[tuple[float, str]] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
     received: dict[str, np.ndarray] = field(default_factory=dict)
+    start: float = 0.0
+    duration: float = 0.0
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -109,3 +118,53 @@ def _check_members(path, data, times):
         if others and not {*JOINT_NAMES, *ROTOR_NAMES} & set(others):
             raise BagError(f'{path}: no recording of this robot: {" and ".join(named)} hold '
                            f'{", ".join(others)}, expected {", ".join(JOINT_NAMES)}')
+
+
+@dataclass(frozen=True)
+class Damage:
+    """
+    One damage of a recording.
+
+    Attributes:
+        run: name of the recording.
+        topic: damaged topic.
+        cause: likely cause in words, with the numbers that show it.
+        at_s: time of the onset after the first IMU message [s]; None: the whole recording.
+        sure: probability of the cause among the compared causes, 0 to 1.
+        fix: description of the repair; None without a certain correction.
+        repair: function that returns a corrected recording, or None.
+
+    """
+
+    run: str
+    topic: str
+    cause: str
+    at_s: float | None = None
+    sure: float = 0.99
+    fix: str | None = None
+    repair: Callable[[Recording], Recording] | None = None
+
+    @property
+    def text(self) -> str:
+        """One line."""
+        moment = '' if self.at_s is None else f', from {self.at_s:.1f} s on'
+        return f'{self.run}: {self.topic}: {self.cause}{moment}'
+
+
+def changed(recording: Recording, topic: str, times=None, values=None,
+            keep=slice(None)) -> Recording:
+    """
+    Copy of a recording with one topic changed.
+
+    Args:
+        recording: original, not modified.
+        topic: topic to change.
+        times: (N,) new stamps [s], or None.
+        values: (N, width) new values, or None.
+        keep: mask or indices of the kept messages, applied last.
+
+    """
+    def part(old, new=None):
+        return old | {topic: (old[topic] if new is None else new)[keep]} if topic in old else old
+    return replace(recording, times=part(recording.times, times), received=part(
+        recording.received), values=part(recording.values, values))

@@ -4,12 +4,16 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from scipy.fft import dct, idct
 from scipy.signal import firwin, upfirdn
+from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.model import rotations
 
 SHARPNESS = 5.0     # number of taps times edge over sampling rate
 THIN = 2            # decimation of the grid for the body equations
+BRIDGED = 0.06      # [s] gaps of inputs that interpolation bridges, about a rotor lag
+SMOOTH = 0.05       # [s] moving average of positions before their derivative
 EDGE = 1.0          # [s] at both ends, for smoothing and history
 
 
@@ -101,7 +105,7 @@ def spread(t, values):
     return t[keep], values[keep]
 
 
-def filled(t, values):
+def bridged(t, values):
     """Samples with linear interpolation across gaps, where a spline would overshoot."""
     usual = np.median(np.diff(t))
     gaps = np.flatnonzero(np.diff(t) > 2.5 * usual)
@@ -137,3 +141,60 @@ def aligned(quaternion):
     flips[flips == 0] = 1
     out[there] *= np.concatenate([[1.0], np.cumprod(flips)])[:, None]
     return out
+
+
+def slow(values, period, highest):
+    """Series (N, n) without its frequencies above ``highest`` [Hz]."""
+    coefficients = dct(values, axis=0, norm='ortho')
+    coefficients[int(2 * len(values) * period * min(highest, 0.5 / period)) + 1:] = 0
+    return idct(coefficients, axis=0, norm='ortho')
+
+
+def rising(values, period):
+    """Derivatives (N, 3) of smoothed values."""
+    width = max(int(round(SMOOTH / period)), 1)
+    padded = np.pad(values, ((width, width), (0, 0)), mode='edge')
+    smooth = np.stack([np.convolve(c, np.ones(width) / width, 'same') for c in padded.T], axis=1)
+    return np.gradient(smooth, period, axis=0)[width:-width]
+
+
+def turning(quaternion, period):
+    """Body rates (N, 3) of quaternions (N, 4)."""
+    turned = Rotation.from_quat(quaternion)
+    return np.pad((turned[:-2].inv() * turned[2:]).as_rotvec() / (2 * period), ((1, 1), (0, 0)),
+                  mode='edge')
+
+
+def filled(values, period):
+    """Values (N, n) with linear interpolation of missing ones, and (N,) where it is short."""
+    t, filled = np.arange(len(values)), np.array(values)
+    known = np.ones(len(values), dtype=bool)
+    for k, column in enumerate(values.T):
+        there = np.flatnonzero(np.isfinite(column))
+        if not len(there):
+            filled[:, k] = 0.0
+            continue
+        filled[:, k] = np.interp(t, there, column[there])
+        after = np.clip(np.searchsorted(there, t), 0, len(there) - 1)
+        before = np.clip(np.searchsorted(there, t, side='right') - 1, 0, None)
+        gap = there[after] - there[before]
+        known &= (gap * period <= BRIDGED) & (t >= there[0]) & (t <= there[-1])
+    return filled, known
+
+
+def derivative(values, period):
+    """Fourth-order central differences (N, n), NaN beside missing samples and at the ends."""
+    out = np.full(values.shape, np.nan)
+    out[2:-2] = (8 * (values[3:-1] - values[1:-3]) - (values[4:] - values[:-4])) / (12 * period)
+    return out
+
+
+def along(thrust, yaw):
+    """Quaternions (N, 4) whose z axis is along a vector (N, 3) in world, with this yaw (N,)."""
+    z = thrust / np.linalg.norm(thrust, axis=1, keepdims=True)
+    heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))], axis=1)
+    y = np.cross(z, heading)
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    matrix = np.stack([np.cross(y, z), y, z], axis=2)
+    matrix[~np.isfinite(matrix).all(axis=(1, 2))] = np.eye(3)
+    return Rotation.from_matrix(matrix).as_quat()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.gap.keys import names_of, number_of
+from beetle_omni_ros.identify.flights.keys import names_of, number_of
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters

@@ -7,13 +7,14 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.identify.gap.ingest import Flight
-from beetle_omni_ros.identify.gap.keys import base_of, names_of, THRUST_BUS, TILT_BUS
-from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.series import (
+from beetle_omni_ros.identify.flights.keys import base_of, names_of, THRUST_BUS, TILT_BUS
+from beetle_omni_ros.identify.recording.bag import BATTERY, COMMAND, IMU, JOINTS, POSE, Recording
+from beetle_omni_ros.identify.recording.parameters import GapParameters
+from beetle_omni_ros.identify.recording.relations import white_noise
+from beetle_omni_ros.identify.recording.series import (
+    bridged,
     derivatives,
     EDGE,
-    filled,
     held_at,
     integral,
     low_pass,
@@ -22,7 +23,6 @@ from beetle_omni_ros.identify.gap.series import (
     turned,
     within,
 )
-from beetle_omni_ros.identify.recording.signals import white_noise
 from beetle_omni_ros.model.catalogue import ignored
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -46,7 +46,7 @@ class Signals:
 
     """
 
-    def __init__(self, flight: Flight, robot: RobotParameters, p: GapParameters):
+    def __init__(self, flight: Recording, robot: RobotParameters, p: GapParameters):
         self.flight, self.robot, self.p = flight, robot, p
         steps = int((flight.duration - 2 * EDGE) / p.grid)
         self.t = EDGE + p.grid * np.arange(steps)
@@ -57,21 +57,23 @@ class Signals:
         self._step, self._begin = FINE / 2, self._fine[0] - p.memory    # of the rotors' filter
         # Linear interpolation would halve the noise power between readings, and a fit would
         # shift the IMU accordingly.
-        self._imu = CubicSpline(*filled(*spread(flight.imu_t, flight.imu)))
-        self._pose = CubicSpline(*filled(*spread(flight.pose_t, flight.pose)))
-        self._joint = CubicSpline(*filled(*spread(
-            flight.joint_t, robot.sensors.tilts(flight.joint))))
-        self._command_t, command = spread(flight.command_t, flight.command)
-        self._command = command
+        times, values = flight.times, flight.values
+        self._imu, self._pose, self._joint = (
+            CubicSpline(*bridged(*spread(times[topic], rows))) for topic, rows in (
+                (IMU, values[IMU]), (POSE, values[POSE]),
+                (JOINTS, robot.sensors.tilts(values[JOINTS]))))
+        self._command_t, self._command = command_t, command = spread(
+            times[COMMAND], values[COMMAND])
         limit = robot.joints.position_limit
-        self._tilt_integral = integral(self._command_t, np.clip(command[:, :4], -limit, limit))
+        self._tilt_integral = integral(command_t, np.clip(command[:, :4], -limit, limit))
         full = robot.battery.full_voltage
-        self.voltage = np.interp(self.t, flight.battery_t, flight.battery[:, 0]) / full \
-            if len(flight.battery_t) > 1 else np.ones(len(self.t))
+        battery_t, battery = times[BATTERY], values[BATTERY].T
+        self.voltage = np.interp(self.t, battery_t, battery[0]) / full \
+            if len(battery_t) > 1 else np.ones(len(self.t))
         if not (0.5 < self.voltage.min() and self.voltage.max() < 1.5):
             self.voltage = np.ones(len(self.t))
-        self.charge = np.interp(self.t, flight.battery_t, flight.battery[:, 1]) \
-            if len(flight.battery_t) else np.zeros(len(self.t))
+        self.charge = np.interp(self.t, battery_t, battery[1]) \
+            if len(battery_t) else np.zeros(len(self.t))
         # Sensor effects and backlash of the robot file; deviations are added to them.
         self.file = {key: float(value) for name, values in robot.effects.items()
                      for parameter, given in values.items()
@@ -80,10 +82,10 @@ class Signals:
                      for key, value in zip(names_of(name, parameter), base_of(
                          CATALOGUE[name].parameters[parameter], given))}
         self._kept: dict = {}
-        third = np.abs(np.diff(flight.joint, 3, axis=0))
+        third = np.abs(np.diff(values[JOINTS], 3, axis=0))
         self.reading_noise = float(np.median(np.sqrt((np.minimum(third, np.quantile(
             third, 0.9, axis=0))**2).mean(axis=0) / 20)))
-        self.position_noise = float(np.median(white_noise(flight.pose[:, :3])))
+        self.position_noise = float(np.median(white_noise(values[POSE][:, :3])))
         self.model_tilts: np.ndarray | None = None
 
     def use_model_tilts(self, model_tilts: np.ndarray) -> None:
@@ -104,6 +106,10 @@ class Signals:
             self._kept[key] = make()
         return self._kept[key]
 
+    def _at(self, spline, shift):
+        """Readings on the fine grid, ``shift`` [s] later, held beyond the first and the last."""
+        return spline(np.clip(self._fine + shift, spline.x[0], spline.x[-1]))
+
     def _smooth(self, fine, edge, derivative=0):
         """Fine series (M, ...) on the common grid."""
         kernel = low_pass(edge, 1, FINE)
@@ -114,7 +120,7 @@ class Signals:
     @cached_property
     def _own_imu(self):
         """Specific force, rates and their derivative (N, 3) each, in axes of the IMU."""
-        fine = self._imu(np.clip(self._fine, self.flight.imu_t[0], self.flight.imu_t[-1]))
+        fine = self._at(self._imu, 0.0)
         edge = self.p.smooth_imu
         return (self._smooth(fine[:, :3], edge), self._smooth(fine[:, 3:], edge),
                 self._smooth(fine[:, 3:], edge, 1))
@@ -153,8 +159,7 @@ class Signals:
 
     def _shifted_pose(self, shift):
         """As :meth:`pose`, without misalignment of MoCap."""
-        fine = self._pose(np.clip(self._fine + shift, self.flight.pose_t[0],
-                                  self.flight.pose_t[-1]))
+        fine = self._at(self._pose, shift)
         position = fine[self._lead::self._ratio][:len(self.t), :3]
         quaternion = self._smooth(fine[:, 3:], 10.0)
         quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
@@ -183,8 +188,7 @@ class Signals:
         delay, gap, late = (theta.get(name, 0.0) for name in names)
 
         def make():
-            fine = self._joint(np.clip(self._fine + delay - late, self.flight.joint_t[0],
-                                       self.flight.joint_t[-1]))
+            fine = self._at(self._joint, delay - late)
             raw = self._smooth(fine, self.p.smooth_reading)
             if gap > 0:
                 fine = play(fine, gap / 2)

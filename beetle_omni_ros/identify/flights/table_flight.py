@@ -15,19 +15,19 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.identify.flights.motion import (
+from beetle_omni_ros.identify.flights.body import BodyModel
+from beetle_omni_ros.identify.flights.keys import Key, names_of
+from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear
+from beetle_omni_ros.identify.recording.series import (
+    aligned,
     along,
     derivative,
     filled,
-    poses,
     rising,
     slow,
     turning,
 )
-from beetle_omni_ros.identify.flights.spectrum import blocks_of
-from beetle_omni_ros.identify.flights.table import Table
-from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.keys import Key, names_of
+from beetle_omni_ros.identify.recording.table import Table
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
@@ -45,23 +45,9 @@ SLOWEST = 0.25          # [Hz] clocks that do not agree up to here are not compa
 NEEDED = {'position': 'position', 'quaternion': 'quaternion', 'specific_force': 'accelerometer',
           'angular_velocity': 'gyroscope'}
 DELAYS = ('rotor_dead_time.delay', 'command_latency.delay')
-
-
-@dataclass(eq=False)
-class Linear:
-    """
-    A flight linearised at a point.
-
-    Attributes:
-        residual: (N, C) measured minus expected at the point.
-        slopes: (N, C, K) derivatives by the keys.
-        measured: (N, C) measurements.
-
-    """
-
-    residual: np.ndarray
-    slopes: np.ndarray
-    measured: np.ndarray
+WINDOW = 2.0        # [s] in which one shift of two clocks is measured
+REACH = 0.15        # [s] largest shift
+LEAST = 3           # windows of which the scatter can be known
 
 
 @dataclass(eq=False)
@@ -316,3 +302,69 @@ class TableFlight:
 def _highest(deviation):
     """Frequency [Hz] up to which stamps with this deviation [s] turn the phase too little."""
     return PHASE / (2 * np.pi * deviation) if deviation else np.inf
+
+
+def poses(table, far):
+    """
+    Positions (N, 3) and quaternions (N, 4) or None, on the clock of the IMU.
+
+    Two clocks are compared by the rates of quaternion and gyroscope, and the median of their
+    shifts is taken out.
+
+    Args:
+        table: the flight.
+        far: height without position [m].
+
+    Returns:
+        positions, quaternions, RMS deviation of the clocks [s].
+
+    """
+    v, signals, h = table.values, table.format.signals, table.period
+    position = filled(v['position'], h)[0] if 'position' in v else np.tile(
+        [0.0, 0.0, far], (len(table), 1))
+    if 'quaternion' not in v:
+        return position, None, np.inf
+    quaternion, seen = filled(aligned(v['quaternion']), h)
+    deviation = table.format.clock_deviation
+    imu = next((signals[name].clock for name in ('angular_velocity', 'specific_force')
+                if name in v), None)
+    if imu not in (None, signals['quaternion'].clock):
+        late, deviation = np.nan, np.inf
+        if 'angular_velocity' in v:
+            felt, known = filled(v['angular_velocity'], h)
+            late, deviation = wander(turning(quaternion, h), felt, seen & known, h)
+        if np.isfinite(late):
+            t = np.arange(len(table)) * h
+            position, quaternion = (np.stack([np.interp(t + late, t, c) for c in x.T], axis=1)
+                                    for x in (position, quaternion))
+    return position, quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), deviation
+
+
+def wander(seen, felt, known, period):
+    """
+    Shift of the clock of one series against that of another, by windows.
+
+    Args:
+        seen: (N, 3) rates of the attitude [rad/s].
+        felt: (N, 3) rates of the gyroscope.
+        known: (N,) samples that count.
+        period: of the samples [s].
+
+    Returns:
+        by how much ``seen`` is late in the median, and the RMS deviation of the windows from it
+        [s]; NaN and infinity if too few windows show it.
+
+    """
+    reach, length = int(REACH / period), int(WINDOW / period)
+    steps, found = np.arange(-reach, reach + 1), []
+    for first in range(reach, len(seen) - length - reach, length):
+        rows = first + np.flatnonzero(known[first:first + length])
+        cost = np.array([((seen[rows + k] - felt[rows])**2).sum() for k in steps])
+        best = int(cost.argmin())
+        if len(rows) > length / 2 and 0 < best < len(steps) - 1:
+            before, here, after = cost[best - 1:best + 2]
+            found.append((steps[best] + 0.5 * (before - after) / (before - 2 * here + after))
+                         * period)
+    if len(found) < LEAST:
+        return np.nan, np.inf
+    return float(np.median(found)), float(np.sqrt(np.mean((found - np.median(found))**2)))

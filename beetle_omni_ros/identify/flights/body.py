@@ -5,7 +5,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.identify.gap.keys import Key, MODULES
+from beetle_omni_ros.identify.flights.keys import Key, MODULES
 from beetle_omni_ros.model import dynamics, native
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters

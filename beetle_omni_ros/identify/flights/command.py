@@ -9,21 +9,19 @@ from rich.console import Console
 from threadpoolctl import threadpool_limits
 
 from beetle_omni_ros.bags.bag import names_of, runs_in
-from beetle_omni_ros.identify.flights.bag_verdict import judged
-from beetle_omni_ros.identify.flights.page import gap_page
+from beetle_omni_ros.identify.flights.apply import write_corrected
+from beetle_omni_ros.identify.flights.page import gap_page, grids, headline
 from beetle_omni_ros.identify.flights.results import ALPHA, result_of
-from beetle_omni_ros.identify.flights.table import Format
-from beetle_omni_ros.identify.flights.table_verdict import judged_tables, load_tables
-from beetle_omni_ros.identify.flights.text import grids, headline
-from beetle_omni_ros.identify.gap.apply import write_corrected
-from beetle_omni_ros.identify.gap.bags import read_recording
-from beetle_omni_ros.identify.gap.ingest import (
+from beetle_omni_ros.identify.flights.verdict import judged, judged_tables, load_tables
+from beetle_omni_ros.identify.recording.bag import read_recording
+from beetle_omni_ros.identify.recording.flight import (
     check_apart,
     check_flights,
     load_flight,
     UnusableFlight,
 )
-from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.recording.parameters import GapParameters
+from beetle_omni_ros.identify.recording.table import Format
 from beetle_omni_ros.identify.robot_file import check_differs
 from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_log
 from beetle_omni_ros.model.files import write_json, write_text
