@@ -22,14 +22,12 @@ from beetle_omni_ros.bags.topics import Qos
 from beetle_omni_ros.control.registry import loaded, snake_case
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.supervisor.events import Answer
-from beetle_omni_ros.supervisor.supervisor import AGE_LIMIT
+from beetle_omni_ros.supervisor.interface import Answer
 
 OK, WARN, ERROR = range(3)      # of diagnostic_msgs/DiagnosticStatus
 DIAGNOSTICS_PERIOD = 1.0        # [s] between two reports of a component
 SILENCE = 0.5           # [s] without a message after which an expected topic has ended
 FUTURE = 0.05           # [s] ahead of the clock above which a stamp is refused
-COMMAND_AGE = AGE_LIMIT     # [s] no older command is executed, by any actuator
 IDENTITY = 'supervisor/identity'
 TEXT_LIMIT = 40         # characters of a foreign identity in an error message
 
@@ -145,7 +143,7 @@ class Host(Protocol):
         """Carry a value to the readers of its topic; ``source`` identifies a supervisor."""
 
     def log(self, severity: str, text: str) -> None:
-        """Log a line, with a severity of :mod:`~beetle_omni_ros.supervisor.events`."""
+        """Log a line, with a severity of :mod:`~beetle_omni_ros.supervisor.interface`."""
 
     def warn(self, kind: str, text: str) -> None:
         """Log a warning; the host may leave out repetitions of a kind."""

@@ -36,8 +36,7 @@ from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
-from beetle_omni_ros.supervisor.events import Event
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import Event, SupervisorParameters
 
 START_TIMEOUT = 5.0      # [s] for the estimator; noisy poses can need longer than ARMING_TIME
 TAKEOFF_TIMEOUT = 30.0   # [s] simulated time for the take-off
@@ -264,7 +263,8 @@ class FlightLoop(Loop):
                     self.start_faults()
                 if reference.state != state:
                     state = reference.state
-                    if simulator.battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
+                    inputs = self.supervisor.inputs
+                    if inputs.battery_low or simulator.battery.charge < SWAP_CHARGE:
                         simulator.battery.reset()
                 if progress and simulator.time - reported >= DIAGNOSTICS_PERIOD:
                     reported += DIAGNOSTICS_PERIOD

@@ -18,9 +18,8 @@ from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight.component import Component, ERROR, IDENTITY, OK, WARN
 from beetle_omni_ros.model.mode import FALLBACK, FLYING, STOPPED
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.supervisor.events import Answer, Event, INFO
-from beetle_omni_ros.supervisor.events import ERROR as SEVERE
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import Answer, Event, INFO, SupervisorParameters
+from beetle_omni_ros.supervisor.interface import ERROR as SEVERE
 from beetle_omni_ros.supervisor.supervisor import Supervisor
 
 # --- estimator -----------------------------------------------------------------------------------
@@ -181,13 +180,13 @@ class SupervisorComponent(Component):
                     'supervisor/actuators')
         self.reads('odom', self._on_odom)
         self.reads('joint_states', self._on_joints, max_age=SENSOR_AGE)
-        self.reads('imu/data_raw', lambda s: supervisor.on_imu(
+        self.reads('imu/data_raw', lambda s: supervisor.inputs.on_imu(
             s.stamp, s.specific_force, s.angular_velocity), max_age=SENSOR_AGE)
-        self.reads('mocap/pose', lambda s: supervisor.on_mocap(
+        self.reads('mocap/pose', lambda s: supervisor.inputs.on_mocap(
             s.stamp, s.position, s.quaternion), max_age=SENSOR_AGE)
-        self.reads('rotor_states', lambda r: supervisor.on_rotors(r.stamp, r.speed),
+        self.reads('rotor_states', lambda r: supervisor.inputs.on_rotors(r.stamp, r.speed),
                    expected=False)
-        self.reads('battery_state', lambda battery: supervisor.on_battery(battery.voltage))
+        self.reads('battery_state', lambda battery: supervisor.inputs.on_battery(battery.voltage))
         for name in controllers:
             self.reads(f'{name}/command', partial(self._on_command, name), expected=False)
         for name in BRIDGES:
@@ -218,13 +217,13 @@ class SupervisorComponent(Component):
         joints = joints.corrected(self._sensors)
         if not np.isnan(joints.position).any():
             self._joints = joints
-        self.supervisor.on_joints(joints.stamp, joints.position, joints.velocity)
+        self.supervisor.inputs.on_joints(joints.stamp, joints.position, joints.velocity)
 
     def _on_odom(self, odom):
         if self._joints is None:
             return
         now = self.host.now()
-        self.supervisor.on_state(State.join(odom, self._joints), now)
+        self.supervisor.inputs.on_state(State.join(odom, self._joints), now)
         if self.supervisor.state != FLYING:     # the fallback controller answers each estimate
             self._triggered = now
             self.step()
@@ -235,13 +234,13 @@ class SupervisorComponent(Component):
 
     def _on_command(self, name, command):
         supervisor, now = self.supervisor, self.host.now()
-        accepted = supervisor.on_command(name, command, now)
+        accepted = supervisor.inputs.on_command(name, command, now)
         if accepted and name == supervisor.active and supervisor.state == FLYING:
             self._triggered = now
             self.step()
 
     def _on_bridge(self, name, text):
-        self.supervisor.on_actuators(name, text, self.host.now())
+        self.supervisor.inputs.on_actuators(name, text, self.host.now())
         self.step()
 
     def step(self) -> None:
@@ -258,12 +257,12 @@ class SupervisorComponent(Component):
         supervisor = self.supervisor
         self.update('supervisor/state', supervisor.mode)
         self.update('supervisor/target', supervisor.target_override)
-        self.update('supervisor/actuators', supervisor.health)
-        for event in supervisor.events:
+        self.update('supervisor/actuators', supervisor.inputs.health)
+        for event in supervisor.inputs.events:
             self.host.log(event.severity, event.text)
             if self._on_event:
                 self._on_event(event)
-        supervisor.events.clear()
+        supervisor.inputs.events.clear()
 
     def _supervisor_status(self):
         supervisor = self.supervisor

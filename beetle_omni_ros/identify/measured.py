@@ -19,8 +19,7 @@ from beetle_omni_ros.identify.rotor.log import COLUMNS, EXPECTED, read_rotor_log
 from beetle_omni_ros.identify.servo.fit import decoded, HIGH, LOW, Search, ServoModel, STARTS
 from beetle_omni_ros.identify.servo.log import HEADER, is_bag, read_joint_log
 from beetle_omni_ros.identify.servo.model import catalogue_values, INDEX, JOINTS, own_delay
-from beetle_omni_ros.model.catalogue import settings
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE, settings
 from beetle_omni_ros.model.files import LogError
 from beetle_omni_ros.model.parameters import RobotParameters, TILT_LAG
 

@@ -8,7 +8,7 @@ from beetle_omni_ros.model.schema import parameter, ParameterError
 from beetle_omni_ros.ros.graph import NODES
 from beetle_omni_ros.ros.node import FlightNode
 from beetle_omni_ros.ros.parameters import file_parameter
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import SupervisorParameters
 
 
 class EkfNode(FlightNode):

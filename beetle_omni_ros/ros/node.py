@@ -112,7 +112,7 @@ class FlightNode(Node):
         self._outputs[topic].publish(value, source or None)
 
     def log(self, severity: str, text: str) -> None:
-        """Log ``text`` with a severity of :mod:`~beetle_omni_ros.supervisor.events`."""
+        """Log ``text`` with a severity of :mod:`~beetle_omni_ros.supervisor.interface`."""
         # One call for each severity: rclpy ties a severity to the line of the call.
         logger = self.get_logger()
         if severity == 'error':

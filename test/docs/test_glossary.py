@@ -12,7 +12,6 @@ TWICE = {
     'Servo': 'numbers of the model; one servo of the bus with its recovery',
     'Register': 'address and size of the driver; storage of the emulated servo',
     'Reference': 'sample of a target; component that publishes targets',
-    'Spread': 'prior of a fit of logs; prior of an entry in flights',
     'Answer': 'of a request; of the actuators in the viewer'}
 
 

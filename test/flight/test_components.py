@@ -15,7 +15,6 @@ from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight import component as base
 from beetle_omni_ros.flight.component import (
-    COMMAND_AGE,
     Component,
     component_class,
     Distribution,
@@ -28,12 +27,12 @@ from beetle_omni_ros.flight.stack import ControllerComponent, Estimator, Supervi
 from beetle_omni_ros.flight.surroundings import Reference, SimulatedRobot
 from beetle_omni_ros.model.allocation import ActuatorHealth
 from beetle_omni_ros.model.body import BodyState
-from beetle_omni_ros.model.mode import Mode
+from beetle_omni_ros.model.mode import COMMAND_AGE, Mode
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.readings import ImuReading, JointReading, PoseReading
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.simulator import Simulator
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import SupervisorParameters
 
 OBSERVER = f"{Path(__file__).parents[2] / 'examples' / 'own_component.py'}:WrenchObserver"
 ROBOT = RobotParameters.load()

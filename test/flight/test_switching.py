@@ -8,7 +8,7 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.loop import FlightLoop
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.supervisor.supervisor import HANDOVER_TIME, THRUST_RATE, TILT_RATE
+from beetle_omni_ros.supervisor.commands import HANDOVER_TIME, THRUST_RATE, TILT_RATE
 
 ROBOT = RobotParameters.load()
 POSES, SWITCHES = 2, 20

@@ -23,7 +23,7 @@ from beetle_omni_ros.flight.surroundings import Reference
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.ros.graph import COMPOSED, in_simulated_time
 from beetle_omni_ros.ros.operator import Operator
-from beetle_omni_ros.sim.fault_lists import parse_faults
+from beetle_omni_ros.sim.faults import parse_faults
 
 ARM, FAULT, SWITCH, LAND, END = ARMING_TIME, 5.0, 6.5, 8.0, 15.0   # [s] of the simulation
 FAULTS, SEED = 'mocap_lost duration=0.4; rotor_weak rotor=2 share=0.9', 5

@@ -11,6 +11,7 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.bags.bag import BagError, read_messages
 from beetle_omni_ros.identify.flights.page import grids as flight_grids
 from beetle_omni_ros.identify.flights.page import head, summary
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.inference.hierarchy import WIDTH
 from beetle_omni_ros.identify.servo.fit import (
     decoded,
@@ -201,7 +202,7 @@ def _rivals(search, name):
     """Rejected entries that explain the log nearly as well in place of an accepted one."""
     entries, s = search.chosen.entries, search.servos
     rivals = {}
-    for other in (rival for rival in CATALOGUE[name].confused_with
+    for other in (rival for rival in TREATMENTS[name].confused_with
                   if rival in NAMED and rival not in entries and rival in search.trials):
         swapped = s.fit([*(e for e in entries if e != name), other],
                         starts=(search.trials[other], search.full), still=search.chosen.still)

@@ -1,9 +1,31 @@
-"""What an operator may set of the supervisor; other limits are constants beside their check."""
+"""What the callers of the supervisor use: its parameters, its events and its answers."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.model.schema import parameter, ParameterFile
+
+INFO, WARNING, ERROR = 'info', 'warning', 'error'
+
+
+class Event(NamedTuple):
+    """An event for the log: time [s], severity, and one line with node and outcome."""
+
+    stamp: float
+    severity: str
+    text: str
+
+
+class Answer(NamedTuple):
+    """The answer to a request: granted or not, with the reason."""
+
+    ok: bool
+    text: str
+
+    def __bool__(self):
+        """Whether the request was granted."""
+        return self.ok
 
 
 @dataclass(frozen=True, kw_only=True)
