@@ -1,7 +1,9 @@
-"""Check of a closed port: absent, not permitted, slow, or ok."""
+"""Check of a port, and that an open one does not block and reports its loss."""
 
 import os
+import pty
 import pwd
+import tty
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +14,7 @@ from serial.tools import list_ports
 
 from beetle_omni_ros.drivers import device_checks as devices
 from beetle_omni_ros.drivers.findings import Findings
+from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 
 
 @pytest.fixture
@@ -56,3 +59,38 @@ def test_product_and_latency_timer_of_an_open_port_are_reported(adapter, monkeyp
     assert devices.open_port(findings, device, 'servo', '/dev/ttyUSB0', 'joint_bridge', None)
     assert [finding.level for finding in findings] == levels
     assert 'FTDI USB' in findings[0].found
+
+
+@pytest.mark.real_time
+def test_a_full_buffer_drops_whole_frames_without_waiting():
+    """Without a reader at the other end, pyserial's write would not return."""
+    device, other = pty.openpty()
+    tty.setraw(other)
+    port = SerialPort(os.ttyname(other), 921600)
+    assert port.read() == b''
+    frames = [bytes([k % 256]) * 55 for k in range(2000)]
+    taken = [k for k, frame in enumerate(frames) if port.write(frame)]
+    assert 10 < len(taken) < 2000
+    received = b''
+    while True:
+        port.flush()
+        try:
+            os.set_blocking(device, False)
+            received += os.read(device, 65536)
+        except BlockingIOError:
+            if not port.rest:
+                break
+    assert received == b''.join(frames[k] for k in taken)
+    port.close()
+
+
+@pytest.mark.real_time
+def test_a_port_whose_other_end_is_closed_is_lost():
+    device, other = pty.openpty()
+    tty.setraw(other)
+    port = SerialPort(os.ttyname(other), 1_000_000)
+    os.write(device, b'last')
+    assert port.read() == b'last'
+    os.close(device)
+    with pytest.raises(SerialPortError, match='unplugged'):
+        port.read()
