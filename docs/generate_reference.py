@@ -242,8 +242,8 @@ def _wrapped(text: str) -> str:
 
 def effects() -> str:
     """The catalogue of effects."""
-    from beetle_omni_ros.model.catalogue import CONSUMERS, ignored
-    from beetle_omni_ros.model.effects import CATALOGUE
+    from beetle_omni_ros.identify.flights.treatment import TREATMENTS
+    from beetle_omni_ros.model.effects import CATALOGUE, CONSUMERS, ignored
     apart: dict[tuple, list] = {}
     for name in CATALOGUE:
         for key, consumer in CONSUMERS.items():
@@ -251,7 +251,8 @@ def effects() -> str:
                 apart.setdefault((consumer, reason), []).append(f'`{name}`')
     rows = [[f'`{name}`', f'`{key}`', spec.unit, _neutral(spec.neutral),
              f'{_number(spec.low)} to {_number(spec.high)}', 'not fitted' if spec.form
-             else _known(spec.typical), _known(spec.smallest),
+             else _number(TREATMENTS[name].sizes[key].typical),
+             '' if spec.form else _number(TREATMENTS[name].sizes[key].smallest),
              '' if spec.default is None else _neutral(spec.default),
              entry.settings.get(key) and f'`{entry.settings[key]}`' or '',
              '4, one for each ' + entry.each if entry.each
@@ -266,9 +267,10 @@ def effects() -> str:
             'effect](../how-to/add_an_effect.md) shows how\nto add an entry.\n\n'
             + table(['effect', 'layer', 'equation, source', 'acts through', 'shows in',
                      'channels', 'confused with', 'separated by'],
-                    [[f'`{name}`', entry.layer, entry.source, _acts(entry), entry.excited_by,
-                      _channels(entry), ', '.join(f'`{other}`' for other in entry.confused_with),
-                      entry.separated_by] for name, entry in CATALOGUE.items()])
+                    [[f'`{name}`', entry.layer, entry.source, _acts(entry), fit.excited_by,
+                      _channels(fit), ', '.join(f'`{other}`' for other in fit.confused_with),
+                      fit.separated_by] for name, entry in CATALOGUE.items()
+                     for fit in [TREATMENTS[name]]])
             + '\n## Parameters\n\n'
             '*Typical* is a realistic deviation from the neutral value. *Smallest* is the '
             'smallest relevant\ndeviation. If the neutral value is the number of the robot '
@@ -285,28 +287,23 @@ def effects() -> str:
                      for (who, reason), names in sorted(apart.items())]))
 
 
-def _channels(entry) -> str:
+def _channels(fit) -> str:
     names = {'B': 'force and torque', 'J': 'joints', 'A': 'acceleration of the MoCap',
              'W': 'rate of turn of the MoCap'}
-    return ', '.join(names[channel] for channel in entry.channels)
+    return ', '.join(names[channel] for channel in fit.channels)
 
 
 def _acts(entry) -> str:
     ways = {'body': 'the body equations', 'servo': 'the servo equation',
             'number': 'a number of the robot file', 'command': 'the delay of commands',
             'sensor': 'readings', 'feedback': 'readings of the encoders', 'play': 'play'}
-    both = ' and the servo equation' if entry.kind == 'body' and entry.servo else ''
-    return ways[entry.kind] + both
+    return ways[entry.kind]
 
 
 def _neutral(value) -> str:
     values = set(value) if isinstance(value, tuple) else {value}
     one = values.pop()
     return 'robot file' if one != one else _number(one)
-
-
-def _known(value) -> str:
-    return '' if value != value else _number(value)
 
 
 def python() -> str:

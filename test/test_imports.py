@@ -17,7 +17,7 @@ ALLOWED = {
     'estimation': ('model',),
     'drivers': ('model', 'bags.messages'),
     'sim': ('model', 'drivers.mavlink'),     # framing of the emulated board
-    'supervisor': ('model', 'control.base', 'control.registry'),
+    'supervisor': ('model', 'control.base', 'control.registry', 'estimation.inputs'),
     'bags': ('model', 'control.base', 'control.registry', 'control.tasks'),
     'show': ('model', 'control.base', 'control.tasks', 'bags'),
     'flight': ('model', 'control', 'estimation', 'drivers', 'sim', 'supervisor', 'bags', 'show'),

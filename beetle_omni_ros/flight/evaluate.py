@@ -25,8 +25,7 @@ from beetle_omni_ros.flight.loop import FlightLoop
 from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.show import table
-from beetle_omni_ros.sim.fault_lists import load_faults
-from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.faults import Fault, load_faults
 
 
 def prepared(controller: str, *, robot: RobotParameters, plant: RobotParameters,

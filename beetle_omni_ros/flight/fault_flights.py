@@ -20,8 +20,7 @@ from beetle_omni_ros.flight.evaluate import prepared
 from beetle_omni_ros.flight.loop import collector_off, FlightLoop
 from beetle_omni_ros.model.mode import DISARMED, FALLBACK, FLYING, MOTORS_OFF
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.sim.fault_lists import Case
-from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.faults import Case, Fault
 from beetle_omni_ros.sim.sensors import Impact, Truth
 from beetle_omni_ros.supervisor.interface import INFO, SupervisorParameters
 

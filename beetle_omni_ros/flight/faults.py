@@ -40,7 +40,7 @@ from beetle_omni_ros.show.page import (
     section,
     verdict_head,
 )
-from beetle_omni_ros.sim.fault_lists import Case, chosen, load_cases
+from beetle_omni_ros.sim.faults import Case, chosen, load_cases
 
 # --- page ----------------------------------------------------------------------------------------
 

@@ -29,7 +29,7 @@ from beetle_omni_ros.flight.stack import (
     Estimator,
     SupervisorComponent,
 )
-from beetle_omni_ros.flight.surroundings import DONE, Reference, SimulatedRobot, WAITING
+from beetle_omni_ros.flight.surroundings import DONE, SimulatedRobot, TaskReference, WAITING
 from beetle_omni_ros.model.mode import FLYING, IN_FLIGHT, MOTORS_OFF, TAKEOFF
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
@@ -250,7 +250,7 @@ class FlightLoop(Loop):
         returns true. ParameterError and RunError: no take-off.
         """
         simulator = self.simulator
-        reference = Reference(task, partial(setattr, simulator, 'payload'))
+        reference = TaskReference(task, partial(setattr, simulator, 'payload'))
         with collector_off():
             self.add(reference)
             self.take_off()

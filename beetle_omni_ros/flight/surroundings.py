@@ -121,7 +121,7 @@ STATE = 'reference/state'
 WAITING, DONE, ABORTED = 'waiting', 'done', 'aborted'
 
 
-class Reference(Component):
+class TaskReference(Component):
     """
     Publishes the targets of a task, beginning when the supervisor reports 'flying'.
 

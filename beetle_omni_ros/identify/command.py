@@ -54,11 +54,11 @@ def run_identify(what: str, paths: Sequence[Path], *, validate: Sequence[Path] =
     servo = rotor = None
     if joints:
         with console.status('identifying the servos'):
-            identified = of_joints.identify(joints, parameters, as_file=whole)
-            servo = servo_values(identified, parameters) if params else None
-        results['servos'] = of_joints.joint_results(identified, others, parameters)
+            search = of_joints.identify(joints, parameters, as_file=whole)
+            servo = servo_values(search, parameters) if params else None
+        results['servos'] = of_joints.joint_results(search, others, parameters)
         tables += of_joints.grids(results['servos'])
-        sections += of_joints.sections(identified, others, parameters) if report else []
+        sections += of_joints.sections(search, others, parameters) if report else []
         texts += [] if whole else results['servos']['text']
     if rotors:
         model = of_rotor.identify_rotor(rotors)

@@ -16,11 +16,10 @@ import numpy as np
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.identify.rotor.log import COLUMNS, EXPECTED, read_rotor_log, UntimedError
-from beetle_omni_ros.identify.servo.fit import decoded, Found, HIGH, LOW, ServoModel, STARTS
+from beetle_omni_ros.identify.servo.fit import decoded, HIGH, LOW, Search, ServoModel, STARTS
 from beetle_omni_ros.identify.servo.log import HEADER, is_bag, read_joint_log
 from beetle_omni_ros.identify.servo.model import catalogue_values, INDEX, JOINTS, own_delay
-from beetle_omni_ros.model.catalogue import settings
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE, settings
 from beetle_omni_ros.model.files import LogError
 from beetle_omni_ros.model.parameters import RobotParameters, TILT_LAG
 
@@ -85,7 +84,7 @@ def _names(path, pattern):
     return any(re.fullmatch(pattern, cell.strip(' \ufeff\n')) for cell in line.split(','))
 
 
-def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict]:
+def servo_values(search: Search, robot: RobotParameters) -> tuple[dict, dict, dict]:
     """
     Effects of the selected servo model.
 
@@ -96,16 +95,16 @@ def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict
         ``effects``, ``intervals`` and the origin of each, by dotted key.
 
     """
-    servos = found.servos
+    servos = search.servos
     spreads = list(servos.spreads)
     for p in (INDEX[name] for name in GAINS):
         spreads[p] = replace(spreads[p], groups=spreads[p].groups | {'log': BETWEEN})
     servos.spreads, kept = spreads, servos.spreads
-    apart = servos.fit(found.chosen.entries, starts=(found.chosen, *STARTS))
+    apart = servos.fit(search.chosen.entries, starts=(search.chosen, *STARTS))
     servos.spreads = kept
     # each: {entry: {parameter: (JOINTS or 1, draws)}}
-    best = _entries(found, found.chosen, None, robot, 1)
-    others = [_entries(found, trial, k, robot, DRAWS) for trial in (found.chosen, apart)
+    best = _entries(search, search.chosen, None, robot, 1)
+    others = [_entries(search, trial, k, robot, DRAWS) for trial in (search.chosen, apart)
               for k in (None, *range(len(servos.logs)))]
     effects: dict = {}
     intervals, origin = {}, {}
@@ -133,25 +132,25 @@ def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict
         intervals[TILT_LAG] = [_plain(low), _plain(high)]
         origin[TILT_LAG] = how | {'how': 'Kd / Kp plus delay [s]; the logs determine the sum '
                                          'better than its parts'}
-    if 'joint_offset' in found.chosen.entries:
-        zeros = MILLI * found.values()[:, INDEX['offset']]
+    if 'joint_offset' in search.chosen.entries:
+        zeros = MILLI * search.values()[:, INDEX['offset']]
         origin['not written: joint_offset'] = how | {
             'how': f'zeros of {zeros.min():.1f} to {zeros.max():.1f} mrad; each homing sets them'}
-    delay = found.values()[:, INDEX['delay']].mean()
+    delay = search.values()[:, INDEX['delay']].mean()
     origin['effects.joint_command_latency.delay'] = how | {
         'how': f'{delay:.4f} s in the mean of the logs, minus {own_delay():.3f} s that the '
                'simulator has; at least 0'}
     return effects, intervals, origin
 
 
-def _entries(found: Found, trial: ServoModel, log: int | None, robot: RobotParameters, draws: int
+def _entries(search: Search, trial: ServoModel, log: int | None, robot: RobotParameters, draws: int
              ) -> dict[str, dict[str, np.ndarray]]:
     """
     Entries of a log, or of the mean of all logs (None): (joints, draws) values of each parameter.
 
     One draw is the estimate. A joint without a log is the median of the others.
     """
-    fit, units = trial.fit, found.servos.units
+    fit, units = trial.fit, search.servos.units
     x = fit.x[:, None]
     if draws > 1:
         factor = np.linalg.cholesky(fit.covariance() + 1e-12 * np.eye(len(fit.x)))
@@ -160,7 +159,7 @@ def _entries(found: Found, trial: ServoModel, log: int | None, robot: RobotParam
     for number in range(1, JOINTS + 1):
         mine = [u for u, (k, _, n) in enumerate(units) if n == number and log in (None, k)]
         if mine:
-            sets.append(found.servos.base[mine[0]][:, None] + fit.s[mine].mean(axis=0) @ x)
+            sets.append(search.servos.base[mine[0]][:, None] + fit.s[mine].mean(axis=0) @ x)
     logs = decoded(np.clip(np.array(sets), LOW[:, None], HIGH[:, None]).transpose(0, 2, 1))
     values = catalogue_values(logs.transpose(2, 0, 1), robot)
     result: dict[str, dict[str, np.ndarray]] = {}

@@ -31,8 +31,7 @@ from beetle_omni_ros.ros.graph import (
 )
 from beetle_omni_ros.ros.operator import NEVER, Operator
 from beetle_omni_ros.show import table
-from beetle_omni_ros.sim.fault_lists import load_faults
-from beetle_omni_ros.sim.faults import DEVICES
+from beetle_omni_ros.sim.faults import DEVICES, load_faults
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start

@@ -10,7 +10,7 @@ from beetle_omni_ros.bags.topics import LATCHED_LOG, LOG, SENSOR, topics_with
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.component import Component, component_class, ERROR, OK, WARN
-from beetle_omni_ros.flight.surroundings import Reference
+from beetle_omni_ros.flight.surroundings import TaskReference
 from beetle_omni_ros.model.schema import parameter, RunError
 from beetle_omni_ros.ros import wire
 from beetle_omni_ros.ros.node import FlightNode
@@ -29,7 +29,7 @@ class ReferenceNode(FlightNode):
             task=parameter('hover', doc='name of a task, or a CSV file of poses'),
             seed=parameter(0, doc='seed of random poses', low=0, high=2**31 - 1))
         payload = self.create_client(SetParameters, 'sim_node/set_parameters')
-        self.run(Reference(
+        self.run(TaskReference(
             make_task(self.parameters.task, self.parameters.seed),
             lambda mass: payload.call_async(wire.parameter_request('payload', mass))))
 

@@ -18,8 +18,7 @@ from beetle_omni_ros.ros.node import FlightNode
 from beetle_omni_ros.ros.parameters import file_parameter
 from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
 from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
-from beetle_omni_ros.sim.fault_lists import parse_faults
-from beetle_omni_ros.sim.faults import DEVICES
+from beetle_omni_ros.sim.faults import DEVICES, parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 

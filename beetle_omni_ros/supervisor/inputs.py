@@ -10,10 +10,10 @@ from math import dist, hypot, isfinite
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, corrected, State
+from beetle_omni_ros.estimation.inputs import SpikeFilter
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.allocation import ActuatorHealth, Allocator
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.readings import SpikeFilter
 from beetle_omni_ros.supervisor.backup import BackupEstimator
 from beetle_omni_ros.supervisor.commands import (
     CommandStream,

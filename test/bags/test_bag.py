@@ -17,8 +17,6 @@ from synthetic_flights import (
     write_diagnostic,
     write_imu,
     write_joints,
-    write_request,
-    write_wrench,
 )
 import yaml
 
@@ -26,7 +24,8 @@ from beetle_omni_ros.bags import conversions
 from beetle_omni_ros.bags.bag import names_of, read_bag
 from beetle_omni_ros.bags.bag_writer import add_meta, BagWriter
 from beetle_omni_ros.bags.log import FlightLog, LogRecorder, Recorder, SERIES
-from beetle_omni_ros.bags.messages import new, to_bytes, TYPESTORE
+from beetle_omni_ros.bags.messages import new, to_bytes, TYPESTORE, Wrench
+from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.model.allocation import ALL_HEALTHY
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -42,7 +41,7 @@ def recorded(tmp_path_factory):
     memory = LogRecorder(META)
     with BagWriter(folder, META) as writer:
         fly(Recorder(memory, writer), make_task('lemniscate'), duration=4.0, start=50.0)
-        write_wrench(Recorder(memory, writer), 53.0, [0, 0, 3.0], [0.5, 0, 0])
+        Recorder(memory, writer).write('disturbance', Wrench(53.0, [0, 0, 3.0], [0.5, 0, 0]))
     return folder, memory.log()
 
 
@@ -115,7 +114,7 @@ def test_values_without_a_stamp_are_read_without_a_warning(tmp_path):
 def test_namespaces_are_removed_and_several_robots_refused(tmp_path):
     with BagWriter(tmp_path / 'bag', namespace='robot1') as writer:
         write_command(writer, 1.0, np.ones(4), np.ones(4))
-        write_request(writer, 'nmpc', 1.0, np.zeros(4), np.ones(4))
+        writer.write('nmpc/command', Command(1.0, np.zeros(4), np.ones(4)))
         write_imu(writer, 2.0, (0, 0, 1), (0, 0, 0))
     log = read_bag(tmp_path / 'bag')
     assert (len(log.command.t), len(log.requests['nmpc'].t), len(log.imu.t)) == (1, 1, 1)

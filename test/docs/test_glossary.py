@@ -9,13 +9,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / 'beetle_omni_ros'
 # Class -> why two rooms have one of this name.
 TWICE = {
-    'Servo': 'numbers of the model; one servo of the bus with its recovery',
-    'Register': 'address and size of the driver; storage of the emulated servo',
-    'Reference': 'sample of a target; component that publishes targets',
-    'Spread': 'prior of a fit of logs; prior of an entry in flights',
-    'Flight': 'recorded signals that gap compares; a graph that flies',
-    'Signals': 'common grid of a flight; readings that are compared in a recording',
-    'Answer': 'of a request; of the actuators in the viewer'}
+    'Servo': 'numbers of the model; one servo of the bus with its recovery'}
 
 
 def modules_of_classes():

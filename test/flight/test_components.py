@@ -24,7 +24,7 @@ from beetle_omni_ros.flight.component import (
 )
 from beetle_omni_ros.flight.loop import FlightLoop
 from beetle_omni_ros.flight.stack import ControllerComponent, Estimator, SupervisorComponent
-from beetle_omni_ros.flight.surroundings import Reference, SimulatedRobot
+from beetle_omni_ros.flight.surroundings import SimulatedRobot, TaskReference
 from beetle_omni_ros.model.allocation import ActuatorHealth
 from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.mode import COMMAND_AGE, Mode
@@ -257,7 +257,7 @@ def test_the_supervisor_signs_its_commands_and_sends_each_once(supervisor):
 def reference():
     """Make the desk of a task that starts at 2000 s."""
     def build(name):
-        desk = Desk(Reference(make_task(name), lambda mass: None), 1999.99)
+        desk = Desk(TaskReference(make_task(name), lambda mass: None), 1999.99)
         proceed(desk)
         assert len(desk.sent) == 1      # 'waiting'
         desk.component.feed('supervisor/state', Mode('flying:nmpc'))

@@ -22,7 +22,7 @@ from beetle_omni_ros.flight.fault_flights import (
     PLAN,
     Watcher,
 )
-from beetle_omni_ros.sim.fault_lists import load_cases
+from beetle_omni_ros.sim.faults import load_cases
 from beetle_omni_ros.sim.sensors import Impact, Truth
 
 TICK = 0.005

@@ -11,8 +11,7 @@ import pytest
 from beetle_omni_ros.identify.flights.apply import write_corrected
 from beetle_omni_ros.identify.flights.keys import entries_of, Entry
 from beetle_omni_ros.identify.flights.results import FORM_DEVIATION, parameters
-from beetle_omni_ros.model.catalogue import ignored
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE, ignored
 from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()

@@ -13,7 +13,14 @@ from scipy.signal import step as step_response
 from scipy.spatial.transform import Rotation, Slerp
 import yaml
 
-from beetle_omni_ros.identify.recording.bag import changed, read_recording
+from beetle_omni_ros.identify.recording.bag import (
+    changed,
+    COMMAND,
+    IMU,
+    JOINTS,
+    POSE,
+    read_recording,
+)
 from beetle_omni_ros.identify.recording.check import checked
 from beetle_omni_ros.identify.recording.flight import prepare, UnusableFlight
 from beetle_omni_ros.identify.recording.parameters import GapParameters, RecordingLimits
@@ -60,7 +67,6 @@ def turned_pose(made, world=None, body=None):
 
 
 P = GapParameters.load()
-IMU, POSE, JOINTS, COMMAND = 'imu/data_raw', 'mocap/pose', 'joint_states', 'command'
 HALF = 12.2
 
 
@@ -263,7 +269,8 @@ def test_what_is_harmless_is_used_and_stated(change, words):
     sound, made = prepare(recording(), ROBOT, P), prepare(change(recording()), ROBOT, P)
     assert not words and not made.findings or any(words in text for text in made.findings)
     assert made.duration == pytest.approx(sound.duration, abs=0.05)
-    assert np.allclose(sound.imu[:999], made.imu[-len(sound.imu):][:999]) or not made.findings
+    before, after = sound.values[IMU], made.values[IMU]
+    assert np.allclose(before[:999], after[-len(before):][:999]) or not made.findings
 
 
 def rested(before, after):

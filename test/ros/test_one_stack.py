@@ -19,11 +19,11 @@ from beetle_omni_ros.bags.log import LogRecorder
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.loop import ARMING_TIME, FlightLoop
-from beetle_omni_ros.flight.surroundings import Reference
+from beetle_omni_ros.flight.surroundings import TaskReference
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.ros.graph import COMPOSED, in_simulated_time
 from beetle_omni_ros.ros.operator import Operator
-from beetle_omni_ros.sim.fault_lists import parse_faults
+from beetle_omni_ros.sim.faults import parse_faults
 
 ARM, FAULT, SWITCH, LAND, END = ARMING_TIME, 5.0, 6.5, 8.0, 15.0   # [s] of the simulation
 FAULTS, SEED = 'mocap_lost duration=0.4; rotor_weak rotor=2 share=0.9', 5
@@ -60,7 +60,7 @@ def in_the_loop(task, epoch):
         name: registry.find(name).make(ROBOT) for name in ('nmpc', 'rl')}
     loop = FlightLoop(ROBOT, ROBOT, controllers, recorder, seed=SEED, conditions='published',
                       epoch=epoch)
-    loop.add(Reference(make_task(task), lambda mass: None))
+    loop.add(TaskReference(make_task(task), lambda mass: None))
     for moment, act in ((ARM, partial(loop.request, 'arm')),
                         (FAULT, lambda: loop.simulator.set_faults(parse_faults(FAULTS)) or True),
                         (SWITCH, partial(loop.select, 'rl')),

@@ -20,13 +20,12 @@ from beetle_omni_ros.identify.flights.keys import delays_of, Key
 from beetle_omni_ros.identify.flights.servo import (
     module_load,
     simulate,
-    spin_load,
-    targets_at,
     undescribed_load,
     Windows,
 )
 from beetle_omni_ros.identify.flights.signals import Signals
 from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.recording.bag import COMMAND, Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.identify.recording.series import low_pass, matrices, THIN, within
@@ -83,6 +82,7 @@ class BagFlight:
         self._starts = np.arange(0, count - self._length + 1, self._length) \
             + round(p.servo_warm_up / p.grid)
         self._kept: tuple = (None, None)        # delays of the last windows, and these
+        self._runs: dict[frozenset, np.ndarray] = {}    # deviations -> simulated servos
         self.trusted = self._trusted()
         first, count = self._starts[0], self._length * len(self._starts)
         self.rows = first + THIN * np.arange(count // THIN)
@@ -151,8 +151,10 @@ class BagFlight:
             result['W'] = within(self._poses, rate - seen, 0)[self.rows]
         if 'J' in groups:
             first, count = self._starts[0], self._length * len(self._starts)
+            run = self._runs.get(frozenset(theta.items()))
+            run = self._servos([theta], theta)[0] if run is None else run
             result['J'] = self._of_joints(self.signals.joints(theta)[3][first:first + count]
-                                          - self._servos([theta], theta)[0].reshape(-1, 4))
+                                          - run.reshape(-1, 4))
         return result
 
     def _of_joints(self, series):
@@ -162,6 +164,12 @@ class BagFlight:
     def linear(self, theta: dict[str, float], names: list[str]) -> Linear:
         """Residual and its slopes at deviations ``theta`` of keys, starts and tangents."""
         theta, own = self._real(theta)
+        ends = {name: self._ends(name, theta, own) for name in names if name in self.starts}
+        # the servos of all at once; none of them changes a sensor
+        sets = list({frozenset(each.items()): each for each in (
+            theta, *(end for both in ends.values() for end in both))}.items())
+        runs = self._servos([each for _, each in sets], theta)
+        self._runs = dict(zip((key for key, _ in sets), runs, strict=True))
         now = self.residual(theta)
         residual = np.concatenate([now[group] for group in PLACE], axis=1)
         slopes = np.zeros((*residual.shape, len(names)))
@@ -175,11 +183,16 @@ class BagFlight:
         of_keys = self._slopes(theta, now, keys)
         for k, name in enumerate(names):
             if name in self.starts:
-                for group, secant in self._secant(name, theta, own, now).items():
-                    slopes[:, PLACE[group], k] = secant
+                groups = ''.join({g for key in self.starts[name] for g in self.keys[key].groups})
+                behind, ahead = (now if end == theta else self.residual(end, groups)
+                                 for end in ends[name])
+                for group in groups:
+                    slopes[:, PLACE[group], k] = (ahead[group] - behind[group]) \
+                        / own.get(name, 1.0)
             elif name in factors:
                 key, part = factors[name]
                 slopes[:, :, k] = part * of_keys[:, :, keys.index(key)]
+        self._runs = {}
         return Linear(residual, slopes, residual)
 
     def _slopes(self, theta, now, names):
@@ -246,17 +259,14 @@ class BagFlight:
                 new[tangent] = 0.0
         return new
 
-    def _secant(self, name, theta, own, now):
-        """Group -> slope (M, n) from no effect to the start, or to the deviation where it acts."""
-        start, factor = self.starts[name], own.get(name, 1.0)
-        groups = ''.join(dict.fromkeys(''.join(self.keys[key].groups for key in start)))
+    def _ends(self, name, theta, own):
+        """Deviations without the effect of a start, and with it as far as it acts, else whole."""
+        start = self.starts[name]
         # of another start of the same effect, only one can act
-        less = {key: theta[key] - factor * part if name in own else 0.0
-                for key, part in start.items()}
-        less = theta | {key: value if abs(value) > 1e-12 else 0.0 for key, value in less.items()}
-        behind = self.residual(less, groups) if any(theta.get(key) for key in start) else now
-        ahead = now if name in own else self.residual(self._started(less, {name: factor}), groups)
-        return {group: (ahead[group] - behind[group]) / factor for group in groups}
+        without = {key: theta[key] - own[name] * part if name in own else 0.0
+                   for key, part in start.items()}
+        without = {key: value for key, value in (theta | without).items() if abs(value) > 1e-12}
+        return without, theta if name in own else self._started(without, {name: 1.0})
 
     def settle(self, theta: dict[str, float]) -> None:
         """
@@ -287,9 +297,18 @@ class BagFlight:
     def _servos(self, sets, at):
         """Simulated servos (P, W, M, 4) of each set, with initial states and loads at ``at``."""
         windows, edges = self._windows(at)
-        targets = [targets_at(self.signals, theta, edges) for theta in sets]
+        delays = [self.signals.delays(theta)[0] for theta in sets]
+        of_delays = {delay: self._targets(edges, delay) for delay in set(delays)}
+        targets = [of_delays[delay] for delay in delays]
         runs = simulate(self.robot, windows, np.array(targets), sets, self.modules)
         return runs.transpose(0, 2, 1, 3)
+
+    def _targets(self, edges, delay):
+        """(K, W, 4) mean delayed commands [rad] between the steps ``edges`` (W, K + 1) [s]."""
+        means = self.signals.tilt_targets(edges.ravel(), delay)
+        # The mean from the end of a window to the next one is dropped.
+        means = np.concatenate([means, means[-1:]]).reshape(*edges.shape, 4)
+        return means[:, :-1].transpose(1, 0, 2)
 
     def _joint_slopes(self, theta, names):
         """
@@ -333,22 +352,24 @@ class BagFlight:
         at = self._starts - round(p.servo_warm_up / p.grid)
         middle = edges[:, :-1] + p.servo_step / 2
         index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
-        loads = (s.thrust({})[0], module_load(s, theta), spin_load(s, theta),
-                 *undescribed_load(s, theta))
-        force, load, spin, *more = (series[index].transpose(1, 0, 2) for series in loads)
-        return Windows(tilt[at], rate[at], force, load, spin, p.servo_step, skip,
+        loads = (s.thrust({})[0], module_load(s, theta), *undescribed_load(s, theta))
+        force, load, *more = (series[index].transpose(1, 0, 2) for series in loads)
+        return Windows(tilt[at], rate[at], force, load, p.servo_step, skip,
                        round(p.grid / p.servo_step), tuple(more)), edges
 
 
-def limit_starts(key, effect, models):
-    """Starts at which a limit begins to act in these flights."""
-    what, below = effect.limit
+def starts_of(key, models):
+    """Starts of an effect without a slope; of a limit, where it begins to act in these flights."""
+    treatment = TREATMENTS[key.effect]
+    if treatment.limit is None:
+        return treatment.starts
+    what, below = treatment.limit
     most = max(float({
         'tilt_rate': lambda m: np.abs(m.signals.joints({})[1]).max(),
         'torque': lambda m: np.quantile(np.abs(_torques(m)), 0.999),
         'thrust': lambda m: np.quantile(m.flight.values[COMMAND][:, 4:], 0.999)}[what](m))
         for m in models)
-    return tuple((float(np.log(part * most / key.base)),) for part, in effect.starts
+    return tuple((float(np.log(part * most / key.base)),) for part, in treatment.starts
                  if part * most < below * key.base)
 
 

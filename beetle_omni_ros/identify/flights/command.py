@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -17,7 +18,7 @@ from beetle_omni_ros.identify.recording.bag import read_recording
 from beetle_omni_ros.identify.recording.flight import (
     check_apart,
     check_flights,
-    load_flight,
+    prepare,
     UnusableFlight,
 )
 from beetle_omni_ros.identify.recording.parameters import GapParameters
@@ -111,14 +112,15 @@ def _bags(runs, holdout, robot, p, fix, alpha, progress):
     flights, errors = [], []
     for path, name in zip(given, names_of(given), strict=True):
         try:
-            flights.append(load_flight(path, robot, p, fix, name))
+            flights.append(prepare(replace(read_recording(path), name=name), robot, p, fix))
         except UnusableFlight as error:
             errors.append(error)
     if errors:
         # A verdict from the other flights would be read as one from all of them.
+        damages = [damage for error in errors for damage in error.problems]
         return result_of('bad_data', {}, str(errors[0]), bad_data=[
-            {'run': d.run, 'topic': d.topic, 'cause': d.cause, 'at_s': d.at_s, 'sure': d.sure,
-             'fix': d.fix} for error in errors for d in error.problems])
+            {key: getattr(damage, key) for key in ('run', 'topic', 'cause', 'at_s', 'sure', 'fix')}
+            for damage in damages])
     check_flights(given, flights, p.same_flight)
     fitted, judging = flights[:len(runs)], flights[len(runs):]
     if not judging and len(fitted) > LEAST_FITTED:

@@ -19,15 +19,16 @@ from operator import attrgetter
 
 import numpy as np
 
+from beetle_omni_ros.identify.flights.treatment import Size, TREATMENTS
 from beetle_omni_ros.identify.recording.parameters import GapParameters
-from beetle_omni_ros.model.catalogue import delaying, ignored
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE, delaying, ignored
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.terms import EffectParameter
 
 MODULES = 'module_reaction'
+NO_SIZE = Size(0.5, 0.0)     # of a parameter that only selects a form
 # Effects without a slope at their neutral value; they need a start where they act.
-LIMITS = tuple(name for name, effect in CATALOGUE.items() if effect.starts)
+LIMITS = tuple(name for name, treatment in TREATMENTS.items() if treatment.starts)
 TILT_BUS, THRUST_BUS = 'base.tilt_delay', 'base.thrust_delay'   # delays of commands
 # Typical and smallest deviations of the catalogue are those of a robot of this size.
 WEIGHT, ARM = 29.8, 0.2754      # [N], [m] params/robot.yaml
@@ -128,31 +129,32 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
         effects['joint_friction'] = dict(zip(CATALOGUE['joint_friction'].parameters,
                                              friction(robot), strict=True))
     for name, effect in CATALOGUE.items():
-        if ignored('gap', name):
+        if name not in TREATMENTS or ignored('gap', name):
             continue
+        treatment = TREATMENTS[name]
         # The file's modules load the joints by their share, so this entry is only the excess.
-        groups = 'B' if name == MODULES and robot.multibody else effect.channels
+        groups = 'B' if name == MODULES and robot.multibody else treatment.channels
         for parameter, spec in effect.parameters.items():
             absent = bool(np.isnan(spec.neutral).any())
             relative = absent or parameter == 'scale'
             own = number_of(robot, spec.number) if absent else spec.neutral
+            size = treatment.sizes.get(parameter, NO_SIZE)
             base = base_of(spec, effects.get(name, {}).get(parameter, own))
             texts = names_of(name, parameter)
             for k, (text, value) in enumerate(zip(texts, base, strict=True)):
                 keys[text] = Key(text, name, parameter, k if len(texts) > 1 else None,
-                                 float(value), relative,
-                                 0.5 if math.isnan(spec.typical) else spec.typical,
-                                 0.0 if math.isnan(spec.smallest) else spec.smallest,
-                                 groups, effect.apply is not None, spec.step, spec.form,
+                                 float(value), relative, size.typical, size.smallest, groups,
+                                 effect.apply is not None, size.step, spec.form,
                                  not relative and spec.low == 0.0)
     return keys
 
 
 def tolerances(p: GapParameters) -> dict[str, float]:
     """Prior deviations of the keys by which every robot differs from the robot file."""
-    result = {key: getattr(p, f'tolerance_{spec.tolerance}')
-            for name, effect in CATALOGUE.items() for parameter, spec in effect.parameters.items()
-            if spec.tolerance for key in names_of(name, parameter)}
+    result = {key: getattr(p, f'tolerance_{size.tolerance}')
+              for name, treatment in TREATMENTS.items()
+              for parameter, size in treatment.sizes.items() if size.tolerance
+              for key in names_of(name, parameter)}
     result['modules.share'] = p.modules_tolerance
     for k in range(4):
         result |= {f'rotor.lag[{k}]': p.tolerance_lag, f'servo.kp[{k}]': p.tolerance_lag,
@@ -185,7 +187,7 @@ def extra_keys() -> dict[str, Key]:
 
 
 @dataclass(frozen=True)
-class Spread:
+class Prior:
     """Prior standard deviations of one key: narrow, of a candidate, between flights."""
 
     narrow: float
@@ -224,7 +226,7 @@ def keys_of(robot: RobotParameters, names: set[str]) -> dict[str, Key]:
             if key.effect in names and not key.form}
 
 
-def spread(robot: RobotParameters, key: Key, tolerance: float, stamps: float) -> Spread:
+def prior_of(robot: RobotParameters, key: Key, tolerance: float, stamps: float) -> Prior:
     """Priors of a key; ``tolerance`` of robots (0: none), ``stamps`` of a clock [s]."""
     unit = CATALOGUE[key.effect].parameters[key.parameter].unit
     size = 1.0 if key.relative else size_of(robot, unit)
@@ -235,9 +237,9 @@ def spread(robot: RobotParameters, key: Key, tolerance: float, stamps: float) ->
             np.linalg.norm(robot.rotors.positions[:, :2], axis=1).mean())
     if plain == 'rotor_dead_time.delay':
         flight = max(flight, stamps)
-    typical = AIR * CATALOGUE['rotor_drag'].parameters['coefficient'].typical if (
+    typical = AIR * TREATMENTS['rotor_drag'].sizes['coefficient'].typical if (
         plain == 'wind.force') else key.typical
-    return Spread(tolerance or 0.5 * key.smallest * size, typical * size, flight)
+    return Prior(tolerance or 0.5 * key.smallest * size, typical * size, flight)
 
 
 def entries_of(keys: dict[str, Key]) -> list[Entry]:
@@ -248,7 +250,8 @@ def entries_of(keys: dict[str, Key]) -> list[Entry]:
         own = tuple(key for parameter in effect.numbers for key in names_of(name, parameter)
                     if key in keys)
         # noise of IMU and MoCap reaches the commands; servos are simulated from commands
-        body = effect.channels[:1] in 'BAW' and 'J' not in effect.channels
+        channels = TREATMENTS[name].channels
+        body = channels[:1] in 'BAW' and 'J' not in channels
         result += [Entry(name, (key,), k + 1, body) for k, key in enumerate(own)] \
             if effect.each else [Entry(name, own, None, body)]
     return result

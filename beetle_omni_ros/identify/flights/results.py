@@ -22,7 +22,7 @@ from beetle_omni_ros.identify.flights.quality import (
     Unexplained,
     unexplained,
 )
-from beetle_omni_ros.model.catalogue import separating_experiment
+from beetle_omni_ros.identify.flights.treatment import separating_experiment, TREATMENTS
 from beetle_omni_ros.model.effects import CATALOGUE
 
 ALPHA = 0.05            # probability of a false alarm that is accepted
@@ -66,7 +66,7 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
         result['next_experiment'] = separating_experiment(unclear[0])
     elif verdict == 'not_decidable' and result['hidden']:
         result['next_experiment'] = Counter(
-            CATALOGUE[name].excited_by for name in result['hidden']).most_common(1)[0][0]
+            TREATMENTS[name].excited_by for name in result['hidden']).most_common(1)[0][0]
     return result | {'summary': summary(result)}
 
 

@@ -28,7 +28,6 @@ class Windows:
         start_rate: (W, 4) measured rates there [rad/s].
         thrust: (K, W, 4) thrust of each joint's rotor at each step [N].
         load: (K, W, 4) torque of motion and gravity on the joint, for share 1 [N m].
-        spin: (K, W, 4) torque of the spinning rotor for each N m s of its momentum [rad/s].
         step: period of the simulation [s].
         skip: steps of warm-up.
         every: steps between samples.
@@ -41,18 +40,10 @@ class Windows:
     start_rate: np.ndarray
     thrust: np.ndarray
     load: np.ndarray
-    spin: np.ndarray
     step: float
     skip: int
     every: int
     undescribed: tuple[np.ndarray, ...] = ()
-
-
-def targets_at(signals: Signals, theta: dict[str, float], edges: np.ndarray) -> np.ndarray:
-    """(K, W, 4) mean delayed commands [rad] between the steps ``edges`` (W, K + 1) [s]."""
-    means = signals.tilt_targets(edges.ravel(), signals.delays(theta)[0])
-    # The mean from the end of a window to the next one is dropped.
-    return np.concatenate([means, means[-1:]]).reshape(*edges.shape, 4)[:, :-1].transpose(1, 0, 2)
 
 
 def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
@@ -86,7 +77,7 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
     loads = _loads(windows, hanging, modules, column)
 
     def terms_at(k):
-        result = ServoTerms(targets[:, k], windows.thrust[k], windows.spin[k])
+        result = ServoTerms(targets[:, k], windows.thrust[k])
         for act, values in acting:
             act(result, None, **values)
         for torque, size in loads:
@@ -131,10 +122,9 @@ def _of_effects(robot, column):
         if effect.servo is None:
             continue
         base = {**robot.effects, **own}.get(name, {})
-        values = {p: np.asarray(base.get(p, spec.neutral)) + column(f'{name}.{p}')
-                  for p, spec in effect.parameters.items()}
-        if effect.apply is None:    # a servo equation is unstable outside the physical range
-            values = {p: np.maximum(x, effect.parameters[p].low) for p, x in values.items()}
+        # a servo equation is unstable outside the physical range
+        values = {p: np.maximum(np.asarray(base.get(p, spec.neutral)) + column(f'{name}.{p}'),
+                                spec.low) for p, spec in effect.parameters.items()}
         if any(values[p].any() for p in effect.numbers):
             acting.append((effect.servo, values))
     return numbers, acting
@@ -195,15 +185,3 @@ def _normal(axis, tilt):
     """(N, 3) thrust direction of a rotor at tilts (N, 1)."""
     level = np.cross(axis, [0.0, 0.0, 1.0])
     return np.cos(tilt) * [0.0, 0.0, 1.0] + np.sin(tilt) * level
-
-
-def spin_load(signals: Signals, theta: dict[str, float]) -> np.ndarray:
-    """Gyroscopic torque on each joint for each N m s of rotor momentum in hover (N, 4) [rad/s]."""
-    tilt, rate = signals.joints(theta)[0], signals.imu(theta)[1]
-    thrust, robot = signals.thrust(theta)[0], signals.robot
-    load = np.empty_like(tilt)
-    for i, axis in enumerate(robot.tilt_axes):
-        normal = _normal(axis, tilt[:, i:i + 1])
-        speed = np.sqrt(np.maximum(thrust[:, i], 0) / robot.hover_thrust)
-        load[:, i] = -robot.rotors.spin[i] * speed * (np.cross(rate, normal) @ axis)
-    return load

@@ -23,8 +23,7 @@ from beetle_omni_ros.identify.recording.series import (
     turned,
     within,
 )
-from beetle_omni_ros.model.catalogue import ignored
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE, ignored
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.servo import play
 

@@ -184,7 +184,7 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
 
     Args:
         residual: (N, C) measured minus expected.
-        slopes: (N, C, K) its derivatives.
+        slopes: (N, C, K) its derivatives; whitened in place, because a copy is 100 MB.
         mask: (N, C) samples that count.
         period: of the samples [s].
         floor: (C,) smallest standard deviation of a sample's noise.
@@ -223,7 +223,7 @@ def _whitened(residual, slopes, mask, filters, warm):
     Missing samples are interpolated in both, so that the linear model stays exact. What follows
     the begin or a long gap does not count.
     """
-    residual, slopes, mask = residual.copy(), slopes.copy(), mask.copy()
+    residual, mask = residual.copy(), mask.copy()
     t = np.arange(len(mask))
     for c in range(mask.shape[1]):
         there = np.flatnonzero(mask[:, c])

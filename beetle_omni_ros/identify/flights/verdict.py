@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.identify.flights.bag_flight import BagFlight, limit_starts
+from beetle_omni_ros.identify.flights.bag_flight import BagFlight, starts_of
 from beetle_omni_ros.identify.flights.balance import Balance, SLOW
 from beetle_omni_ros.identify.flights.body import BodyModel, swing_of, tilting_modules
 from beetle_omni_ros.identify.flights.engine import Engine
@@ -19,8 +19,8 @@ from beetle_omni_ros.identify.flights.keys import (
     extra_keys,
     keys_of,
     LIMITS,
-    Spread,
-    spread,
+    Prior,
+    prior_of,
     THRUST_BUS,
     TILT_BUS,
     tolerances,
@@ -30,6 +30,7 @@ from beetle_omni_ros.identify.flights.quality import explained
 from beetle_omni_ros.identify.flights.results import ALPHA, concluded, result_of
 from beetle_omni_ros.identify.flights.signals import IMU_LAG
 from beetle_omni_ros.identify.flights.table_flight import COMPARED, GROUPS, TableFlight
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.recording.bag import Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.identify.recording.table import Format, read_flight
@@ -72,21 +73,21 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     coarse = float(np.median([m.signals.position_noise for m in models])) > p.coarse_noise
     late, kept = _delays(robot, p, coarse)
     tolerance = tolerances(p) | late
-    spreads, entries, bounds, far = _priors(robot, {
+    priors, entries, bounds, far = _priors(robot, {
         n: key for n, key in keys.items() if key.effect in CATALOGUE and not key.form
         and key.effect not in LIMITS}, tolerance)
-    spreads |= {n: Spread(tolerance[n], key.typical, 0.0) for n, key in extra_keys().items()
+    priors |= {n: Prior(tolerance[n], key.typical, 0.0) for n, key in extra_keys().items()
                 if n != 'modules.share' or robot.multibody is not None}
     for start, own in starts.items():
         name, moved = start.partition('@')[0], [f'{start}~{key}' for key in own]
-        spreads[start] = Spread(0.03, 1.0, 0.0)
-        spreads |= {tangent: Spread(0.001, 0.3, 0.0) for tangent in moved}
-        entries.append(Entry(name, (start, *moved), None, CATALOGUE[name].channels == 'B'))
+        priors[start] = Prior(0.03, 1.0, 0.0)
+        priors |= {tangent: Prior(0.001, 0.3, 0.0) for tangent in moved}
+        entries.append(Entry(name, (start, *moved), None, TREATMENTS[name].channels == 'B'))
     bounds |= dict.fromkeys(starts, (0.0, np.inf)) | kept
-    varying = {n: VARYING[n.partition('[')[0]] for n in spreads if n.partition('[')[0] in VARYING}
+    varying = {n: VARYING[n.partition('[')[0]] for n in priors if n.partition('[')[0] in VARYING}
     if len(models) > 1:
-        spreads |= {n: replace(spreads[n], flight=0.0) for n in varying}
-    engine = Engine(models, [*spreads], spreads, entries, bounds, far, alpha, varying=varying,
+        priors |= {n: replace(priors[n], flight=0.0) for n in varying}
+    engine = Engine(models, priors, entries, bounds, far, alpha, varying=varying,
                     kept=frozenset(kept), clock=IMU_LAG, curved=frozenset({*starts, *tangents}))
     solution = engine.run()
     for model in others:
@@ -101,11 +102,11 @@ def _priors(robot, keys, tolerance, stamps=0.0, weighed=WEIGHED):
 
     A mass is weighed and sensors have data sheets; maps of thrust differ by half.
     """
-    spreads = {n: spread(robot, key, tolerance.get(n, 0.0), stamps) for n, key in keys.items()}
+    priors = {n: prior_of(robot, key, tolerance.get(n, 0.0), stamps) for n, key in keys.items()}
     bounds = {n: (0.0, np.inf) for n, key in keys.items() if key.ends_at_none}
     far = frozenset(n for n, key in keys.items() if key.effect not in weighed
                     and CATALOGUE[key.effect].layer not in ('sensor', 'timing'))
-    return spreads, entries_of(keys), bounds, far
+    return priors, entries_of(keys), bounds, far
 
 
 def _choose_modules(models, every):
@@ -126,10 +127,8 @@ def _starts(keys, models):
     """Name of a start -> deviations of the keys of its effect."""
     result = {}
     for name in LIMITS:
-        effect = CATALOGUE[name]
         own = [key for key in keys.values() if key.effect == name and not key.form]
-        values = limit_starts(own[0], effect, models) if effect.limit else effect.starts
-        for k, start in enumerate(values):
+        for k, start in enumerate(starts_of(own[0], models)):
             result[f'{name}@{k}'] = dict(zip([key.name for key in own], start, strict=True))
     return result
 
@@ -170,13 +169,13 @@ def _engine(flights, robot, p, declared, alpha, progress):
         names -= {'imu_misalignment', 'wind', 'rotor_drag', 'body_drag'}
     keys = keys_of(robot, names)
     # Air is still in a hall.
-    spreads, entries, bounds, far = _priors(robot, keys, tolerances(p), declared.clock_deviation,
+    priors, entries, bounds, far = _priors(robot, keys, tolerances(p), declared.clock_deviation,
                                             (*WEIGHED, 'wind'))
     if 'specific_force' not in signals:     # the lag is that of an estimator
-        spreads |= {name: replace(spreads[name], narrow=spreads[name].typical)
+        priors |= {name: replace(priors[name], narrow=priors[name].typical)
                     for name, key in keys.items() if key.effect in LAGS}
         entries = [entry for entry in entries if entry.name not in LAGS]
-    return Engine(flights, list(keys), spreads, entries, bounds, far, alpha, progress), keys
+    return Engine(flights, priors, entries, bounds, far, alpha, progress), keys
 
 
 def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format

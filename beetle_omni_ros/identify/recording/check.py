@@ -7,6 +7,7 @@ import numpy as np
 from beetle_omni_ros.identify.recording.bag import changed, Damage, NEEDED, Recording
 from beetle_omni_ros.identify.recording.parameters import shipped
 from beetle_omni_ros.identify.recording.relations import (
+    COMMAND,
     Mistake,
     mistakes,
     Relation,
@@ -186,7 +187,8 @@ class Comparison:
     def explained(self) -> list[Damage]:
         """The most likely mistake, if it resolves a contradiction and makes no other one."""
         tried = [self._with(mistake) for mistake in mistakes() if self._suspected(mistake)]
-        tried += [late for h in tried if (late := self._since(h))]
+        # A sensor can turn on the way; what a command means does not change during a flight.
+        tried += [late for h in tried if h.mistake.topic != COMMAND and (late := self._since(h))]
         best = max([self.usual, *tried], key=lambda h: h.score)
         if best.mistake is None or not any(
                 name in best.mistake.touches and not self._contradicts(name, best)

@@ -1,6 +1,5 @@
 """From a recording to a checked flight, or the reason why it is unusable."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 import hashlib
 from pathlib import Path
@@ -17,7 +16,6 @@ from beetle_omni_ros.identify.recording.bag import (
     IMU,
     NEEDED,
     POSE,
-    read_recording,
     Recording,
 )
 from beetle_omni_ros.identify.recording.check import checked
@@ -28,6 +26,7 @@ from beetle_omni_ros.identify.recording.topics import begin_of
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
+LEAST = 50     # messages of a topic
 TABLES = ('.csv', '.gz')     # endings of files that are no bags
 
 
@@ -82,67 +81,49 @@ def _aloft(recording, when, begin, end, p):
 
 class UnusableFlight(ValueError):
     """
-    A recording cannot be used; the text states the reason in one line.
+    A recording cannot be used; the text states the first of its ``problems`` in one line.
 
     Attributes:
         problems: the detected damages.
 
     """
 
-    def __init__(self, text: str, problems: Sequence[Damage] = ()):
-        super().__init__(text)
-        self.problems = list(problems)
-
-
-def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
-                fix: bool = False, name: str = '') -> Recording:
-    """
-    Read and check one recording.
-
-    With ``fix``, certain corrections are applied to the data. ``name`` replaces the folder's name
-    in messages.
-
-    Raises:
-        BagError: no such bag, or no recording of this robot.
-        UnusableFlight: with name and damages of the recording.
-
-    """
-    recording = read_recording(path)
-    recording.name = name or recording.name
-    return prepare(recording, robot, p, fix)
+    def __init__(self, *problems: Damage):
+        super().__init__(problems[0].text)
+        self.problems = problems
 
 
 def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
             fix: bool = False) -> Recording:
     """
-    Check a recording and select the flight; see :func:`load_flight`.
+    Check a recording and select the flight.
+
+    With ``fix``, certain corrections are applied to the data.
 
     Raises:
         UnusableFlight: with name and damages of the recording.
 
     """
     name = recording.name
-    missing = [topic for topic in NEEDED if len(recording.times[topic]) < 50]
-    if missing:
-        counts = ', '.join(f'{topic} ({len(recording.times[topic])} messages)'
-                           for topic in missing)
-        raise UnusableFlight(f'{name}: missing or nearly empty: {counts}', [
-            Damage(name, topic, f'{len(recording.times[topic])} messages') for topic in missing])
+    counts = {topic: len(recording.times[topic]) for topic in NEEDED}
+    if few := [Damage(name, topic, f'missing or nearly empty: {count} messages')
+               for topic, count in counts.items() if count < LEAST]:
+        raise UnusableFlight(*few)
     part = flown(_with_charge(recording), robot, p)
     if part is None:
-        raise _unusable(name, COMMAND, 'the robot does not fly: commanded thrust is never above '
-                        f'{p.lifted:g} of its weight')
+        raise UnusableFlight(Damage(name, COMMAND, 'the robot does not fly: commanded thrust is '
+                                    f'never above {p.lifted:g} of its weight'))
     origin = begin_of(recording)
     recording, lead = part
     recording, done, wrong = checked(recording, robot, origin, fix)
     if wrong:
-        raise UnusableFlight(wrong[0].text, wrong)
+        raise UnusableFlight(*wrong)
     findings = [*recording.findings, *done]
     series = {topic: _in_order(name, topic, recording, findings) for topic in recording.times}
     begin, end = _without_gaps(name, series, lead, p, findings, origin)
     if end - begin < p.least_duration:
-        raise _unusable(name, 'all topics', f'{max(end - begin, 0.0):.1f} s of usable flight, '
-                        f'{p.least_duration:.3g} s are needed')
+        raise UnusableFlight(Damage(name, 'all topics', f'{max(end - begin, 0.0):.1f} s of usable '
+                                    f'flight, {p.least_duration:.3g} s are needed'))
     times, values = {}, {}
     for topic, (t, rows) in series.items():
         keep = (t > begin - 1.0) & (t < end + 0.5)
@@ -155,12 +136,6 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
     pose[:, 3:] = aligned(pose[:, 3:] / np.where(norm > 1e-6, norm, 1.0))
     _check_robot(name, values, robot, p)
     return Recording(name, times, values, findings=findings, start=begin, duration=end - begin)
-
-
-def _unusable(name, topic, cause, at_s=None):
-    """An error with one damage, as the checks of :mod:`recording` report it."""
-    damage = Damage(name, topic, cause, at_s)
-    return UnusableFlight(damage.text, [damage])
 
 
 def _in_order(name, topic, recording, findings):
@@ -206,8 +181,8 @@ def _without_gaps(name, series, lead, p, findings, origin):
             findings.append(f'{name}: {topic}: silent for {silence:.2f} s, from {at_s:.1f} s on')
     if lost > p.most_lost * max(end - begin, 1e-9) and lost > 1.0:
         silence, topic, at_s = longest
-        raise _unusable(name, topic, f'silent for {silence:.2f} s; {lost:.1f} s of '
-                        f'{end - begin:.1f} s of flight are missing', at_s)
+        raise UnusableFlight(Damage(name, topic, f'silent for {silence:.2f} s; {lost:.1f} s of '
+                                    f'{end - begin:.1f} s of flight are missing', at_s))
     edges = [begin, *(x for gap in sorted(breaks) for x in gap), end]
     pieces = [(edges[k], edges[k + 1]) for k in range(0, len(edges), 2)]
     return max(pieces, key=lambda piece: piece[1] - piece[0])
@@ -217,14 +192,14 @@ def _check_robot(name, values, robot, p):
     """Refuse a flight of a completely different robot."""
     total = np.median(np.linalg.norm(values[IMU][:, :3], axis=1))
     if total < 0.3 * robot.gravity:
-        raise _unusable(name, IMU, f'specific force is {total:.2f} m/s^2, '
-                        f'near {robot.gravity:.2f} m/s^2 expected')
+        raise UnusableFlight(Damage(name, IMU, f'specific force is {total:.2f} m/s^2, near '
+                                    f'{robot.gravity:.2f} m/s^2 expected'))
     commanded = np.median(values[COMMAND][:, 4:].sum(axis=1)) / robot.mass
     # Thrusts may partly cancel each other, so only too small a sum is impossible.
     if commanded < (1 - p.wrong_robot) * total or commanded > 3 * total:
-        raise _unusable(name, COMMAND, 'the robot file does not fit: commanded thrust '
-                        f'over its mass is {commanded:.1f} m/s^2, the IMU measures '
-                        f'{total:.1f} m/s^2')
+        raise UnusableFlight(Damage(
+            name, COMMAND, 'the robot file does not fit: commanded thrust over its mass is '
+            f'{commanded:.1f} m/s^2, the IMU measures {total:.1f} m/s^2'))
 
 
 def check_apart(runs: list[Path]) -> None:

@@ -24,8 +24,11 @@ def _edge(doc):
     return parameter(doc=doc, unit='Hz', low=0.1, high=100)
 
 
-def _share(doc):
-    return parameter(doc=doc, unit='1', low=0, high=1)
+def _size(unit, doc, high=1):
+    return parameter(doc=doc, unit=unit, low=0, high=high)
+
+
+_share = partial(_size, '1')
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,40 +44,34 @@ class GapParameters:
     smooth_joint: float = _edge('Low-pass edge of tilts as inputs of the model.')
     smooth_pose: float = _edge('Low-pass edge of MoCap velocities as inputs of the model.')
     smooth_reading: float = _edge('Low-pass edge of encoder readings that are compared.')
-    guide_above: float = parameter(
-        doc='Encoder noise above which a servo model gives the fast part of tilts.',
-        unit='rad', low=0, high=1)
+    guide_above: float = _size(
+        'rad', 'Encoder noise above which a servo model gives the fast part of tilts.')
     guide_edge: float = _edge('Edge below which these tilts come from the encoders.')
-    coarse_noise: float = parameter(
-        doc='MoCap noise above which the IMU gives the fast part of the velocity.',
-        unit='m', low=0, high=1)
+    coarse_noise: float = _size(
+        'm', 'MoCap noise above which the IMU gives the fast part of the velocity.')
     velocity_edge: float = _edge('Edge above which velocity comes from the IMU, with noisy MoCap.')
     tolerance_mass: float = _share('Prior deviation of the mass.')
     tolerance_inertia: float = _share('Prior deviation of each moment of inertia.')
     tolerance_thrust: float = _share('Prior deviation of thrust, of each rotor and of all.')
-    tolerance_position: float = parameter(
-        doc='Prior deviation of a rotor position, each axis.', unit='m', low=0, high=1)
+    tolerance_position: float = _size('m', 'Prior deviation of a rotor position, each axis.')
     tolerance_lag: float = _share('Prior deviation of lags and servo gains.')
     tolerance_torque_ratio: float = _share('Prior deviation of torque over thrust.')
-    tolerance_bias_accelerometer: float = parameter(
-        doc='Prior deviation of the bias of the accelerometer.', unit='m/s^2', low=0, high=10)
-    tolerance_bias_gyroscope: float = parameter(
-        doc='Prior deviation of the bias of the gyroscope.', unit='rad/s', low=0, high=1)
-    tolerance_angle: float = parameter(
-        doc='Prior deviation of mountings and joint zeros.', unit='rad', low=0, high=1)
+    tolerance_bias_accelerometer: float = _size(
+        'm/s^2', 'Prior deviation of the bias of the accelerometer.', 10)
+    tolerance_bias_gyroscope: float = _size(
+        'rad/s', 'Prior deviation of the bias of the gyroscope.')
+    tolerance_angle: float = _size('rad', 'Prior deviation of mountings and joint zeros.')
     tolerance_delay: float = _time('Prior deviation of delays of sensors.', 1e-6, 0.1)
     imu_averaging: float = _time('Latency of an IMU by averaging.', 0, 0.1)
     coarse_imu: float = _time('Possible latency of an IMU beside a noisy MoCap.', 1e-6, 1)
     coarse_encoders: float = _time('Possible latency of encoders beside it.', 1e-6, 1)
-    tolerance_swing: float = parameter(
-        doc='Log ratio by which the apparent inertia of a servo may differ.', unit='1', low=0,
-        high=10)
+    tolerance_swing: float = _size(
+        '1', 'Log ratio by which the apparent inertia of a servo may differ.', 10)
     modules_tolerance: float = _share('Prior deviation of the terms of the tilting modules.')
     command_delay: float = _time('Nominal delay from a stamp to the actuator.', 0, 0.1)
     bus_near: float = _time('Prior deviation of that delay, of each bus.', 1e-6, 1)
     bus_late: float = _time('Most by which a bus is late without a finding.', 1e-6, 1)
-    contact_height: float = parameter(
-        doc='Height of base_link below which feet may touch.', unit='m', low=0, high=10)
+    contact_height: float = _size('m', 'Height of base_link below which feet may touch.', 10)
     limit_margin: float = _share('Share of the largest thrust up to which samples count.')
     settle: float = _time('Unused time after take-off.', 0)
     lifted: float = _share('Commanded thrust over weight from which the robot flies.')

@@ -173,7 +173,7 @@ def map_rows(rows: Rows, thrust: Surface) -> list[dict]:
     """
     top, u = rows['duty'].max(), (rows['duty'] * rows['voltage']).max()
     most = means(rows['thrust'], rows['step']).max()
-    running, found = rows['voltage'][rows['duty'] > 0.01], []
+    running, plateaus = rows['voltage'][rows['duty'] > 0.01], []
     for voltage in np.linspace(
             running.max(), (1 - BELOW) * running.min(), MAP_ROWS):
         duty = GRID * min(top, u / voltage)
@@ -182,12 +182,12 @@ def map_rows(rows: Rows, thrust: Surface) -> list[dict]:
             np.gradient(level, duty), 1e-3)) for level in levels.T])    # least error of thrust
         error = np.gradient(levels[:, 0], 50 * duty) * (
             np.polyval(cubics[0], levels[:, 0] / 10) - 50 - 50 * duty)
-        found.append({
+        plateaus.append({
             'voltage_V': float(voltage), 'thrust_max_N': float(min(levels[-1, 0], most)),
             'coefficients': {f'c{k}': estimate(cubics[:, 3 - k], '%') for k in range(4)},
             'rms_N': float(np.sqrt(np.mean(error**2))),
             'thrust_half_width_N': float(max(np.ptp(interval(one)) for one in levels) / 2)})
-    return found
+    return plateaus
 
 
 def respond(time, static, up, down):

@@ -271,9 +271,9 @@ class Servos:
 
 
 @dataclass(frozen=True)
-class Found:
+class Search:
     """
-    The selected model of some logs.
+    Result of the search for the terms that some logs need.
 
     Attributes:
         servos: the logs with their noise.
@@ -296,7 +296,7 @@ class Found:
 
 
 def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least: float = 0.0,
-           named: bool = False) -> Found:
+           named: bool = False) -> Search:
     """
     Add the entries that raise the evidence, largest gain first, and remove those that do not.
 
@@ -354,7 +354,7 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
                         for name in rejected}
     gains = {name: (gain(chosen) - gain(trial)) * (1 if name in chosen.entries else -1)
              for name, trial in trials.items()}
-    return Found(servos, full, chosen, trials, gains)
+    return Search(servos, full, chosen, trials, gains)
 
 
 def error_rms(log: JointLog, joint: int, values: np.ndarray, held: bool = True,

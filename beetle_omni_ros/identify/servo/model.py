@@ -20,8 +20,7 @@ import numpy as np
 
 from beetle_omni_ros.identify.inference.hierarchy import Spread
 from beetle_omni_ros.identify.servo.log import JointLog
-from beetle_omni_ros.model.catalogue import delaying
-from beetle_omni_ros.model.effects import per_joint
+from beetle_omni_ros.model.effects import delaying, per_joint
 from beetle_omni_ros.model.native import built, EXACT, generated
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import share_path

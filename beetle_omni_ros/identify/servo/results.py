@@ -12,10 +12,10 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.inference.hierarchy import WIDTH
 from beetle_omni_ros.identify.servo.fit import (
     error_rms,
-    Found,
     LOGARITHMIC,
     mask,
     rms,
+    Search,
     select,
     ServoModel,
     Servos,
@@ -47,7 +47,7 @@ TRADED = 0.6        # least correlation of a pair that a log does not separate
 DELAYS = np.arange(0.0, 0.12, 5e-4)     # [s] of a line
 
 
-def identify(logs: Sequence[JointLog], robot: RobotParameters, as_file: bool = False) -> Found:
+def identify(logs: Sequence[JointLog], robot: RobotParameters, as_file: bool = False) -> Search:
     """
     Identify the servos from the first part of some logs.
 
@@ -60,12 +60,12 @@ def identify(logs: Sequence[JointLog], robot: RobotParameters, as_file: bool = F
     return select(Servos(logs, file_sets(robot, flown=True), as_file), always, allowed)
 
 
-def interval(found: Found, trial: ServoModel, unit: int, name: str) -> tuple[float, float]:
+def interval(search: Search, trial: ServoModel, unit: int, name: str) -> tuple[float, float]:
     """95 % interval of a term of a unit; open for a limit that the logs did not reach."""
     p = INDEX[name]
-    log = found.servos.logs[found.servos.units[unit][0]]
+    log = search.servos.logs[search.servos.units[unit][0]]
     if not mask(trial.entries)[p]:
-        value, reached = float(found.values(trial)[unit, p]), log.reached()
+        value, reached = float(search.values(trial)[unit, p]), log.reached()
         return (reached[name], np.inf) if name in reached else (value, value)
     width = WIDTH * np.sqrt(trial.fit.spread()[unit, p, p])
     ends = trial.fit.theta[unit, p] + width * np.array([-1, 1])
@@ -95,12 +95,12 @@ class Line:
             - log.measured[joint, rows]
 
 
-def left_out_rms(found: Found, unit: int) -> tuple[float, float]:
+def left_out_rms(search: Search, unit: int) -> tuple[float, float]:
     """RMS errors [rad] of servo and line at kinds of motion that their fits leave out."""
-    s, fit, (k, joint, _) = found.servos, found.chosen.fit, found.servos.units[unit]
+    s, fit, (k, joint, _) = search.servos, search.chosen.fit, search.servos.units[unit]
     block, rows = s.blocks[unit], s.rows[k]
     mine = np.array(s.labels['log']) == k
-    read, slopes = s.readings(k, fit.theta[mine], mask(found.chosen.entries))
+    read, slopes = s.readings(k, fit.theta[mine], mask(search.chosen.entries))
     moved = slopes[:, joint].T @ fit.s[unit] @ fit.deviations.T
     servo = read[joint] - s.logs[k].measured[joint, rows] + moved[np.arange(len(rows)), block]
     line = [Line(s.logs[k], joint, rows[block != b]).errors(s.logs[k], joint, rows[block == b])
@@ -108,24 +108,24 @@ def left_out_rms(found: Found, unit: int) -> tuple[float, float]:
     return rms(servo), rms(np.concatenate(line))
 
 
-def joint_results(found: Found, validations: Sequence[JointLog], robot: RobotParameters) -> dict:
+def joint_results(search: Search, validations: Sequence[JointLog], robot: RobotParameters) -> dict:
     """Return ``meta``, ``joints`` (those of the first log) and ``text``, their summary."""
-    log, fit = found.servos.logs[0], found.chosen.fit
-    joints = [_joint(found, unit, validations, robot)
-              for unit, (k, *_) in enumerate(found.servos.units) if k == 0]
-    return {'meta': {'log': log.name, 'logs': [each.name for each in found.servos.logs],
+    log, fit = search.servos.logs[0], search.chosen.fit
+    joints = [_joint(search, unit, validations, robot)
+              for unit, (k, *_) in enumerate(search.servos.units) if k == 0]
+    return {'meta': {'log': log.name, 'logs': [each.name for each in search.servos.logs],
                      'validate': [other.name for other in validations],
                      'converged': bool(fit.converged), 'version': __version__},
             'joints': joints, 'text': _merged(joints)}
 
 
-def _joint(found, unit, validations, robot):
-    log, (_, index, number) = found.servos.logs[0], found.servos.units[unit]
+def _joint(search, unit, validations, robot):
+    log, (_, index, number) = search.servos.logs[0], search.servos.units[unit]
     file, is_held = file_sets(robot)[number - 1], held(robot)
-    values, first, last = found.values()[unit], slice(0, log.end), slice(log.end, None)
+    values, first, last = search.values()[unit], slice(0, log.end), slice(log.end, None)
     known = [(other, other.joints.index(number) if number in other.joints else None)
              for other in validations]
-    line, apart = Line(log, index, found.servos.rows[0]), left_out_rms(found, unit)
+    line, apart = Line(log, index, search.servos.rows[0]), left_out_rms(search, unit)
     best = 'servo' if apart[0] <= apart[1] else 'line'
 
     def of_line(other, k, part=slice(None)):
@@ -135,7 +135,7 @@ def _joint(found, unit, validations, robot):
         return error_rms(other, k, values, part=part) if best == 'servo' else of_line(
             other, k, part)
 
-    traded = inseparable(found, unit)
+    traded = inseparable(search, unit)
     return {
         'joint': number, 'best': best,
         'left_out_rms_rad': dict(zip(('servo', 'line'), apart, strict=True)),
@@ -150,36 +150,36 @@ def _joint(found, unit, validations, robot):
         'published_heldout_rms_rad': error_rms(log, index, file, is_held, part=last),
         'published_validation_rms_rad': [
             None if k is None else error_rms(other, k, file, is_held) for other, k in known],
-        'terms': _terms(found, unit), 'traded': traded,
-        'text': sentences(found, unit, traded, best)}
+        'terms': _terms(search, unit), 'traded': traded,
+        'text': sentences(search, unit, traded, best)}
 
 
-def _terms(found, unit):
+def _terms(search, unit):
     """Every term; a rejected one as fitted when its entry was tried last."""
     result = {}
-    for entry in sorted(ENTRIES, key=lambda name: name in found.chosen.entries):
-        kept = entry in found.chosen.entries
-        trial = found.chosen if kept else found.trials.get(entry, found.chosen)
+    for entry in sorted(ENTRIES, key=lambda name: name in search.chosen.entries):
+        kept = entry in search.chosen.entries
+        trial = search.chosen if kept else search.trials.get(entry, search.chosen)
         for name in ENTRIES[entry]:
-            low, high = interval(found, trial, unit, name)
-            result[name] = {'value': float(found.values(trial)[unit, INDEX[name]]),
+            low, high = interval(search, trial, unit, name)
+            result[name] = {'value': float(search.values(trial)[unit, INDEX[name]]),
                             'unit': TERMS[name].unit, 'kept': kept,
                             'interval': [low, high if np.isfinite(high) else None]}
     return {name: result[name] for name in NAMES}
 
 
-def inseparable(found: Found, unit: int) -> list[list[str]]:
+def inseparable(search: Search, unit: int) -> list[list[str]]:
     """Pairs of terms of a unit, both badly determined, that move together."""
-    covariance = found.chosen.fit.spread()[unit]
+    covariance = search.chosen.fit.spread()[unit]
     scale = np.array([term.scale for term in TERMS.values()])
     deviation = np.sqrt(np.diag(covariance))
-    loose = [p for p in np.flatnonzero(mask(found.chosen.entries))
+    loose = [p for p in np.flatnonzero(mask(search.chosen.entries))
              if WIDTH * deviation[p] > LOOSE * scale[p]]
     return [sorted([NAMES[p], NAMES[o]]) for k, p in enumerate(loose) for o in loose[k + 1:]
             if abs(covariance[p, o]) > TRADED * deviation[p] * deviation[o]]
 
 
-def sentences(found: Found, unit: int, traded: list[list[str]], best: str) -> list[str]:
+def sentences(search: Search, unit: int, traded: list[list[str]], best: str) -> list[str]:
     """Inseparable pairs, proposed log, limits that were not reached, and a better line."""
     text = []
     pairs = [' and '.join(TERMS[name].words or name for name in pair) for pair in traded]
@@ -188,10 +188,10 @@ def sentences(found: Found, unit: int, traded: list[list[str]], best: str) -> li
                     'predict it equally well.')
     if ['delay', 'natural_frequency'] in traded:
         text.append('To separate delay and bandwidth, log a 3.8 Hz sine of 0.25 rad for 10 s.')
-    unmet = [name for entry in LIMITS if entry not in found.chosen.entries
+    unmet = [name for entry in LIMITS if entry not in search.chosen.entries
              for name in ENTRIES[entry]]
     if unmet:
-        values = found.values()[unit]
+        values = search.values()[unit]
         used = ' and '.join(f'{values[INDEX[name]]:.3g} {TERMS[name].unit}' for name in unmet)
         text.append(f'Not reached in this log: {" and ".join(TERMS[n].words for n in unmet)}; '
                     f'predictions use {used} as in the robot file.')
@@ -261,10 +261,10 @@ def flown_errors(logs: Sequence[JointLog], robots: dict[str, RobotParameters]) -
                 ['', *(f'joint {number}' for number in logs[0].joints)], rows)
 
 
-def sections(found: Found, others: Sequence[JointLog], robot: RobotParameters) -> list[str]:
+def sections(search: Search, others: Sequence[JointLog], robot: RobotParameters) -> list[str]:
     """A section with responses and errors of each log."""
-    logs = found.servos.logs
-    models = dict(zip(logs[0].joints, found.values(), strict=False))     # of the first log
+    logs = search.servos.logs
+    models = dict(zip(logs[0].joints, search.values(), strict=False))     # of the first log
     with matplotlib.rc_context(STYLE):
         return [section(
             other.name + (': fitted to the shaded part' if k < len(logs) else ': not fitted'),
