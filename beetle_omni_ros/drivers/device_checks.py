@@ -5,12 +5,9 @@ Servos get pings and reads only: nothing moves and no setting changes. The motor
 to by its driver; no rotor turns, and an armed board is disarmed at the end.
 """
 
-import grp
 from math import inf
 import os
 from pathlib import Path
-import pwd
-import stat
 import time
 
 import numpy as np
@@ -45,31 +42,6 @@ CELL, CELL_FAIL = (3.7, 4.25), (3.5, 4.25)
 
 # --- ports --------------------------------------------------------------------------------------
 
-def unusable_port(path: str) -> tuple[str, str]:
-    """Check a port without opening it; return what is wrong and the remedy, '' for nothing."""
-    try:
-        status = os.stat(path)
-    except PermissionError:
-        return f'{path}: no permission for its folder', 'ask the owner of the folder'
-    except OSError:
-        if os.path.islink(path):
-            return (f'{path}: the link leads to {os.readlink(path)}, which does not exist',
-                    'plug the adapter in again')
-        ports = '; '.join(f'{device}: {product}' for device, product in usb_ports().items())
-        return f'{path}: no such port', (
-            f'name one of the present ports ({ports}), or give it this name by the udev rule of '
-            f'{GUIDE}' if ports else 'no USB serial port is present: plug the adapter in, check '
-            '`dmesg`')
-    if not stat.S_ISCHR(status.st_mode):
-        return f'{path}: no serial port', 'name the device, such as /dev/ttyUSB0'
-    if not os.access(path, os.R_OK | os.W_OK):
-        user, group = pwd.getpwuid(os.geteuid()).pw_name, grp.getgrgid(status.st_gid).gr_name
-        return (f'{path}: no permission for {user} ({stat.filemode(status.st_mode)}, group '
-                f'{group})', f'sudo usermod -aG {group} {user}, then log out and in again; or '
-                f'install the udev rule of {GUIDE}: GROUP="dialout", MODE="0660"')
-    return '', ''
-
-
 def open_port(findings, device, name, path, bridge, graph):
     """
     Open ``device`` on its port ``path``; return whether it is open.
@@ -78,17 +50,14 @@ def open_port(findings, device, name, path, bridge, graph):
     running bridge has open is judged by the topics of this bridge in ``graph``.
     """
     item = f'{name} port'
-    found, remedy = unusable_port(path)
-    if not found:
-        try:
-            device.open()
-        except SerialPortError as error:
-            found, remedy = str(error), GUIDE
-    if found and graph and graph.runs(bridge) and 'another process' in found:
-        findings.add(item, f'{found}; not opened, see what {bridge}_node reports')
-    elif found:
-        findings.add(item, found, fail=remedy)
-    if found:
+    try:
+        device.open()
+    except SerialPortError as error:
+        if graph and graph.runs(bridge) and 'another process' in str(error):
+            findings.add(item, f'{error}; not opened, see what {bridge}_node reports')
+        else:
+            ports = '; '.join(f'{device}: {product}' for device, product in usb_ports().items())
+            findings.add(item, str(error), fail=f'{GUIDE}; present USB ports: {ports or "none"}')
         return False
     real = os.path.realpath(path)
     names = [path if real == path else f'{path} ({real})', usb_ports().get(real)]

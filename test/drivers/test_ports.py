@@ -1,8 +1,8 @@
 """Check of a port, and that an open one does not block and reports its loss."""
 
+import errno
 import os
 import pty
-import pwd
 import tty
 from types import SimpleNamespace
 
@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip('serial')
 
+import serial
 from serial.tools import list_ports
 
 from beetle_omni_ros.drivers import device_checks as devices
@@ -29,24 +30,27 @@ def adapter(tmp_path, monkeypatch):
     return timer
 
 
-def test_a_missing_port_lists_the_existing_ports(adapter, monkeypatch):
-    found, remedy = devices.unusable_port('/dev/beetle_servos')
-    assert found == '/dev/beetle_servos: no such port'
-    assert '/dev/ttyUSB0: FTDI USB <-> Serial (USB VID:PID=0403:6014 SER=FT4THV5O)' in remedy
-    monkeypatch.setattr(list_ports, 'comports', lambda: [])
-    assert 'no USB serial port is present' in devices.unusable_port('/dev/beetle_servos')[1]
+@pytest.mark.parametrize('present', [True, False])
+def test_a_missing_port_lists_the_existing_ports(adapter, monkeypatch, present):
+    if not present:
+        monkeypatch.setattr(list_ports, 'comports', lambda: [])
+    findings, path = Findings(), '/dev/beetle_servos'
+    device = SimpleNamespace(open=lambda: SerialPort(path, 9600))
+    assert not devices.open_port(findings, device, 'servo', path, 'joint_bridge', None)
+    (finding,) = findings
+    assert finding.level == 'fail' and f'{path}: cannot be opened (no such port' in finding.found
+    assert finding.remedy.endswith(
+        '/dev/ttyUSB0: FTDI USB <-> Serial (USB VID:PID=0403:6014 SER=FT4THV5O)' if present
+        else 'none')
 
 
 def test_a_port_without_permission_is_reported_with_the_remedy(monkeypatch):
-    device, line = os.openpty()
-    name, user = os.ttyname(line), pwd.getpwuid(os.geteuid()).pw_name
-    assert devices.unusable_port(name) == ('', '')
-    monkeypatch.setattr(devices.os, 'access', lambda *_: False)
-    monkeypatch.setattr(devices.grp, 'getgrgid', lambda _: SimpleNamespace(gr_name='dialout'))
-    found, remedy = devices.unusable_port(name)
-    os.close(device)
-    os.close(line)
-    assert f'no permission for {user}' in found and f'usermod -aG dialout {user}' in remedy
+    def refuse(*_, **__):
+        raise PermissionError(errno.EACCES, 'Permission denied')
+
+    monkeypatch.setattr(serial, 'Serial', refuse)
+    with pytest.raises(SerialPortError, match='no permission; add the user to the group dialout'):
+        SerialPort('/dev/ttyUSB0', 9600)
 
 
 @pytest.mark.parametrize(('timer', 'levels'), [
@@ -54,7 +58,6 @@ def test_a_port_without_permission_is_reported_with_the_remedy(monkeypatch):
 def test_product_and_latency_timer_of_an_open_port_are_reported(adapter, monkeypatch, timer,
                                                                 levels):
     adapter.write_text(timer)
-    monkeypatch.setattr(devices, 'unusable_port', lambda path: ('', ''))
     findings, device = Findings(), SimpleNamespace(open=lambda: None)
     assert devices.open_port(findings, device, 'servo', '/dev/ttyUSB0', 'joint_bridge', None)
     assert [finding.level for finding in findings] == levels
