@@ -9,7 +9,6 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.drivers.device_checks import check_board, check_servos
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.drivers.findings import check_topics, FAIL, Findings, ObservedGraph, OK, WARN
 from beetle_omni_ros.model.files import write_json
@@ -35,6 +34,7 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
 
     Raises:
         ParameterError: unusable input, in one line.
+        ModuleNotFoundError: a library of the drivers of an unskipped device.
 
     """
     for part in skip:
@@ -50,9 +50,11 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
         with console.status(f'listening to ROS for {seconds:g} s'):
             graph = _observed(listen, seconds, ros)
     if 'servos' not in skip:
+        from beetle_omni_ros.drivers.device_checks import check_servos  # has driver libraries
         with console.status(f'checking the servos on {bus.port}'):
             found['servos'] = check_servos(bus, robot_parameters.joints, graph)
     if 'board' not in skip:
+        from beetle_omni_ros.drivers.device_checks import check_board
         with console.status(f'listening to the motor board on {link.port}'):
             found['board'] = check_board(link, robot_parameters, seconds, graph)
     if 'ros' not in skip:
@@ -73,8 +75,10 @@ def _observed(listen, seconds, findings):
     try:
         return listen(seconds)
     except ModuleNotFoundError as error:
-        findings.missing('ROS', error, 'ros',
-                         'source /opt/ros/jazzy/setup.bash, or --skip ros, or ')
+        module = (error.name or '').partition('.')[0]
+        findings.add('ROS', f"the module '{module}' is not installed",
+                     fail='source /opt/ros/jazzy/setup.bash, or --skip ros, or pip install '
+                     "'beetle_omni_ros[ros]'")
     except (OSError, RuntimeError) as error:
         findings.add('ROS', f"does not start: {' '.join(str(error).split())}",
                      fail='check RMW_IMPLEMENTATION and network; or --skip ros')

@@ -5,19 +5,20 @@ Servos get pings and reads only: nothing moves and no setting changes. The motor
 to by its driver; no rotor turns, and an armed board is disarmed at the end.
 """
 
-import grp
 from math import inf
 import os
 from pathlib import Path
-import pwd
-import stat
 import time
 
 import numpy as np
 
-from beetle_omni_ros.drivers import servo_registers as registers
+from beetle_omni_ros.drivers import servo_xc330 as xc330
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.drivers.findings import Findings, ObservedGraph
+from beetle_omni_ros.drivers.mavlink import CONTRACT_VERSION, NO_HOST_HEARTBEAT
+from beetle_omni_ros.drivers.motor_board import MotorBoard
+from beetle_omni_ros.drivers.serial_port import SerialPortError, usb_ports
+from beetle_omni_ros.drivers.servo_link import ServoLink
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.parts import JointParameters
 
@@ -41,32 +42,6 @@ CELL, CELL_FAIL = (3.7, 4.25), (3.5, 4.25)
 
 # --- ports --------------------------------------------------------------------------------------
 
-def unusable_port(path: str) -> tuple[str, str]:
-    """Check a port without opening it; return what is wrong and the remedy, '' for nothing."""
-    try:
-        status = os.stat(path)
-    except PermissionError:
-        return f'{path}: no permission for its folder', 'ask the owner of the folder'
-    except OSError:
-        if os.path.islink(path):
-            return (f'{path}: the link leads to {os.readlink(path)}, which does not exist',
-                    'plug the adapter in again')
-        from beetle_omni_ros.drivers.serial_port import usb_ports
-        ports = '; '.join(f'{device}: {product}' for device, product in usb_ports().items())
-        return f'{path}: no such port', (
-            f'name one of the present ports ({ports}), or give it this name by the udev rule of '
-            f'{GUIDE}' if ports else 'no USB serial port is present: plug the adapter in, check '
-            '`dmesg`')
-    if not stat.S_ISCHR(status.st_mode):
-        return f'{path}: no serial port', 'name the device, such as /dev/ttyUSB0'
-    if not os.access(path, os.R_OK | os.W_OK):
-        user, group = pwd.getpwuid(os.geteuid()).pw_name, grp.getgrgid(status.st_gid).gr_name
-        return (f'{path}: no permission for {user} ({stat.filemode(status.st_mode)}, group '
-                f'{group})', f'sudo usermod -aG {group} {user}, then log out and in again; or '
-                f'install the udev rule of {GUIDE}: GROUP="dialout", MODE="0660"')
-    return '', ''
-
-
 def open_port(findings, device, name, path, bridge, graph):
     """
     Open ``device`` on its port ``path``; return whether it is open.
@@ -74,19 +49,15 @@ def open_port(findings, device, name, path, bridge, graph):
     Adds the port and the latency timer of a USB adapter, or why it is closed. A port that a
     running bridge has open is judged by the topics of this bridge in ``graph``.
     """
-    from beetle_omni_ros.drivers.serial_port import SerialPortError, usb_ports
     item = f'{name} port'
-    found, remedy = unusable_port(path)
-    if not found:
-        try:
-            device.open()
-        except SerialPortError as error:
-            found, remedy = str(error), GUIDE
-    if found and graph and graph.runs(bridge) and 'another process' in found:
-        findings.add(item, f'{found}; not opened, see what {bridge}_node reports')
-    elif found:
-        findings.add(item, found, fail=remedy)
-    if found:
+    try:
+        device.open()
+    except SerialPortError as error:
+        if graph and graph.runs(bridge) and 'another process' in str(error):
+            findings.add(item, f'{error}; not opened, see what {bridge}_node reports')
+        else:
+            ports = '; '.join(f'{device}: {product}' for device, product in usb_ports().items())
+            findings.add(item, str(error), fail=f'{GUIDE}; present USB ports: {ports or "none"}')
         return False
     real = os.path.realpath(path)
     names = [path if real == path else f'{path} ({real})', usb_ports().get(real)]
@@ -110,12 +81,6 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters,
     ``graph`` is the observed ROS graph, used if a bridge has the port open.
     """
     findings = Findings()
-    try:
-        from beetle_omni_ros.drivers.serial_port import SerialPortError
-        from beetle_omni_ros.drivers.servo_link import ServoLink
-    except ModuleNotFoundError as error:
-        findings.missing(BUS, error, 'hardware')
-        return findings
     link = ServoLink(parameters.port, parameters.baud_rate, parameters.reply_time)
     if open_port(findings, link, 'servo', parameters.port, 'joint_bridge', graph):
         try:
@@ -128,15 +93,13 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters,
 
 
 def _check_bus(findings, link, parameters, joints):
-    from beetle_omni_ros.drivers.servo_bus import ATTEMPTS, examine, make_servos
-    from beetle_omni_ros.drivers.servo_link import ServoBusError
-    servos = make_servos(parameters)
-    problems = [examine(link, servo) for servo in servos]
-    present = [servo for servo in servos if servo.model is not None]
+    servos = xc330.make_servos(parameters)
+    examined = [(servo, xc330.examine(link, servo)) for servo in servos]
+    present = [servo for servo, found in examined if found.model is not None]
     for servo in present:
         try:
-            servo.torque = bool(link.read(servo.identifier, registers.TORQUE_ENABLE, ATTEMPTS))
-        except ServoBusError:
+            servo.torque = bool(link.read(servo.identifier, xc330.TORQUE_ENABLE, xc330.ATTEMPTS))
+        except xc330.ServoBusError:
             servo.torque = None
     if not present:
         findings.add(BUS, f'no servo answers at {link.baud_rate} bit/s', fail="check the servos' "
@@ -144,21 +107,21 @@ def _check_bus(findings, link, parameters, joints):
                      'DYNAMIXEL Wizard their baud rates')
         return
     _check_answers(findings, link, present)
-    for servo, (problem, remedy) in zip(servos, problems, strict=True):
-        if servo.model is None:
+    for servo, (model, firmware, problem, remedy) in examined:
+        if model is None:
             findings.add(servo.name, f'id {servo.identifier} {problem}',
                          fail='check its connector, and those before it in the chain; search '
                          'for its id and baud rate with DYNAMIXEL Wizard', id=servo.identifier)
             continue
         facts, values = f'id {servo.identifier}', {}
-        if servo.firmware is not None:
-            facts += f', model {servo.model}, firmware {servo.firmware}, {servo.voltage:.1f} V, ' \
+        if firmware is not None:
+            facts += f', model {model}, firmware {firmware}, {servo.voltage:.1f} V, ' \
                 f'{servo.temperature:.0f} C, {servo.position:+.2f} rad'
             values = {'supply_V': servo.voltage, 'temperature_C': servo.temperature,
                       'position_rad': servo.position}
         findings.add(servo.name, f'{problem}; {facts}' if problem else facts,
-                     fail=remedy if problem else '', id=servo.identifier, model=servo.model,
-                     firmware=servo.firmware, baud_rate=link.baud_rate, **values)
+                     fail=remedy if problem else '', id=servo.identifier, model=model,
+                     firmware=firmware, baud_rate=link.baud_rate, **values)
         if values:
             _check_servo(findings, servo, joints)
 
@@ -166,8 +129,8 @@ def _check_bus(findings, link, parameters, joints):
 def _check_servo(findings, servo, joints):
     """Add a finding for each problem of supply, temperature, torque and turn."""
     name, volts, angle = servo.name, servo.voltage, servo.position
-    limit = registers.unambiguous_limit(joints.position_limit)
-    doubts = registers.settle([servo], joints.position_limit)       # the driver's rule
+    limit = xc330.unambiguous_limit(joints.position_limit)
+    doubts = xc330.settle([servo], joints.position_limit)       # the driver's rule
     rows = Findings()
     rows.grade(f'{name} supply', f'{volts:.1f} V, allowed are {SUPPLY_FAIL[0]:g} to '
                f'{SUPPLY_FAIL[1]:g} V, below {SUPPLY[0]:g} V it is slower and weaker than '
@@ -187,14 +150,13 @@ def _check_servo(findings, servo, joints):
 
 def _check_answers(findings, link, servos):
     """Add a finding about the loss and the duration of answers to single reads."""
-    from beetle_omni_ros.drivers.servo_link import ServoBusError
     asked, times = ROUNDS * len(servos), []
     for servo in servos * ROUNDS:
         started = time.perf_counter()
         try:
-            link.read(servo.identifier, registers.PRESENT_POSITION)
+            link.read(servo.identifier, xc330.PRESENT_POSITION)
             times.append(1e3 * (time.perf_counter() - started))
-        except ServoBusError:
+        except xc330.ServoBusError:
             continue
     missing = asked - len(times)
     median, slowest = (np.median(times), max(times)) if times else (np.nan, np.nan)
@@ -213,11 +175,6 @@ def check_board(parameters: MotorBoardParameters, robot: RobotParameters, second
                 graph: ObservedGraph | None = None) -> Findings:
     """Check the motor board, listening for ``seconds``; otherwise as :func:`check_servos`."""
     findings = Findings()
-    try:
-        from beetle_omni_ros.drivers.motor_board import MotorBoard
-    except ModuleNotFoundError as error:
-        findings.missing(BOARD, error, 'hardware')
-        return findings
     board = MotorBoard(parameters, robot)
     if not open_port(findings, board, 'board', parameters.port, 'rotor_bridge', graph):
         return findings
@@ -266,7 +223,6 @@ def _listen(board, seconds):
 
 
 def _check_status(findings, status):
-    from beetle_omni_ros.drivers.motor_board_state import CONTRACT_VERSION, NO_HOST_HEARTBEAT
     stopped = '' if status.stop_reason == 'none' else f', last disarmed: {status.stop_reason}'
     findings.add(
         'board firmware', f'contract {status.contract}, {status.state}{stopped}',

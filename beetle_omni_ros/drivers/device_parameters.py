@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.drivers.servo_registers import BAUD_RATES
 from beetle_omni_ros.model.schema import parameter, ParameterError, ParameterFile
+
+BAUD_RATES = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)  # of servos
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -68,12 +68,6 @@ class Findings(list[Finding]):
         self.add(item, found, fail='' if fail[0] <= value <= fail[1] else remedy,
                  warn='' if warn[0] <= value <= warn[1] else remedy, **values)
 
-    def missing(self, item: str, error: ModuleNotFoundError, extra: str, remedy: str = '') -> None:
-        """Add a finding about an item that needs a library of the pip extra ``extra``."""
-        module = (error.name or '').partition('.')[0]
-        self.add(item, f"not checked: the module '{module}' is not installed",
-                 fail=f"{remedy}pip install 'beetle_omni_ros[{extra}]'")
-
 
 # --- the observed graph -------------------------------------------------------------------------
 

@@ -10,10 +10,18 @@ import time
 
 import numpy as np
 
-from beetle_omni_ros.drivers import motor_board_state as messages
+from beetle_omni_ros.drivers import mavlink
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.mavlink import BOARD, common, HOST, MavlinkReceiver, restarted
-from beetle_omni_ros.drivers.motor_board_state import BoardState, RotorStates
+from beetle_omni_ros.drivers.mavlink import (
+    ArmCommand,
+    BOARD,
+    BoardState,
+    common,
+    HOST,
+    MavlinkReceiver,
+    restarted,
+    RotorStates,
+)
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 from beetle_omni_ros.model.mode import COMMAND_AGE, DISARMED, Mode, MOTORS_OFF
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -24,68 +32,12 @@ TICK = 0.01             # [s] longest sleep of the thread, a tenth of its shorte
 CORRECTION = 50_000     # [us] a larger backward step of the board's clock is a restart
 HEARTBEAT_PERIOD = 0.2  # [s] by the contract, as the next three
 TIMESYNC_PERIOD, TIMESYNC_PERIOD_UNKNOWN = 0.2, 0.05    # [s]; the second until it is answered
-ACKNOWLEDGE_TIMEOUT = 0.1   # [s] until a command is repeated
-ATTEMPTS = 5            # of a command
 RECONNECT = 0.05        # [s] between attempts to open a lost port
-RESULTS = {1: 'refused', 2: 'denied', 3: 'unsupported', 4: 'failed'}
 
 RESTS, ARMS, FLIES, LOST = 'rests', 'arms', 'flies', 'lost'
 # A board that is not ready is tolerated for this long [s], counted in steps of at most STEP [s]:
 # after a pause of this process the waiting messages of the board are read first.
 PATIENCE, STEP = 0.05, 0.01
-
-
-class ArmCommand:
-    """
-    One arm or disarm command, repeated until the board acknowledges it.
-
-    ``send(message)`` sends it, first in the first :meth:`tick`. ``accepted`` is whether the board
-    accepted it, None while it is pending, and ``reason`` the reason of a refusal.
-    """
-
-    def __init__(self, arm: bool, send: Callable):
-        self.arm, self.reason = arm, ''
-        self.accepted: bool | None = None
-        self._send, self._next, self._attempts = send, -math.inf, 0
-        self._done = threading.Event()
-
-    def tick(self, now: float) -> None:
-        """Send it, or fail, if no acknowledgement arrived in time."""
-        if self.accepted is not None or now < self._next:
-            return
-        if self._attempts >= ATTEMPTS:
-            self.end(False, f'no acknowledgement to {self._attempts} attempts')
-            return
-        self._next = now + ACKNOWLEDGE_TIMEOUT
-        self._send(common.MAVLink_command_long_message(
-            *BOARD, common.MAV_CMD_COMPONENT_ARM_DISARM, self._attempts, float(self.arm),
-            0, 0, 0, 0, 0, 0))
-        self._attempts += 1
-
-    def acknowledge(self, message, state: BoardState) -> None:
-        """Handle a COMMAND_ACK; an accepted one changes the state before the result is set."""
-        if message.command != common.MAV_CMD_COMPONENT_ARM_DISARM \
-                or bool(message.result_param2 & 1) != self.arm:
-            return
-        if message.result == common.MAV_RESULT_ACCEPTED:
-            state.acknowledged(self.arm)
-            self.end(True)
-            return
-        text = RESULTS.get(message.result, f'result {message.result}')
-        reason = ', '.join(messages.conditions_of(message.result_param2 >> 8 & 0xFF))
-        self.end(False, f'{text} by the board: {reason or "no reason given"}')
-
-    def end(self, accepted: bool, reason: str = '') -> None:
-        """Set the result, if it is pending."""
-        if self.accepted is None:
-            self.accepted, self.reason = accepted, reason
-            self._done.set()
-
-    def wait(self) -> ArmCommand:
-        """Return itself with the result, after 0.7 s at most."""
-        if not self._done.wait(ACKNOWLEDGE_TIMEOUT * (ATTEMPTS + 2)):
-            self.end(False, 'the thread of the link does not run')
-        return self
 
 
 class MotorBoard:
@@ -151,10 +103,10 @@ class MotorBoard:
             return 'no message from the board'
         if status is None:
             return 'no heartbeat of the board'
-        if status.contract != messages.CONTRACT_VERSION:
+        if status.contract != mavlink.CONTRACT_VERSION:
             return (f'firmware follows contract {status.contract}, '
-                    f'this driver {messages.CONTRACT_VERSION}')
-        if messages.NO_HOST_HEARTBEAT in status.conditions:
+                    f'this driver {mavlink.CONTRACT_VERSION}')
+        if mavlink.NO_HOST_HEARTBEAT in status.conditions:
             return 'the board receives no heartbeat of this computer'
         if state.voltage is None:
             return 'battery voltage unknown'
@@ -384,7 +336,7 @@ class Arming:
             missing = 'disarming is not confirmed yet'
         if not missing:
             missing = ', '.join(text for text in self._board.state.status.conditions
-                                if text in messages.BLOCKS_ARMING)
+                                if text in mavlink.BLOCKS_ARMING)
         return missing or ('' if self._supervisor else 'no message from the supervisor')
 
     def _check_answer(self):
@@ -408,6 +360,6 @@ def _disarm_cause(status):
     """Reason why an armed board is not armed any more."""
     if status is None or status.stop_reason == 'none':
         return 'restarted'
-    if status.state == 'boot' or status.stop_reason == messages.WATCHDOG_RESET:
-        return f'restarted ({messages.WATCHDOG_RESET})'
+    if status.state == 'boot' or status.stop_reason == mavlink.WATCHDOG_RESET:
+        return f'restarted ({mavlink.WATCHDOG_RESET})'
     return f'{status.state} ({status.stop_reason})'

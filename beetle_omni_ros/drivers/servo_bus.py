@@ -1,152 +1,30 @@
 """Driver of the servo bus for the joint bridge: settings, torque, goals, feedback, recovery."""
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-import struct
+from collections.abc import Callable
+from itertools import cycle
 from subprocess import Popen
 import time
 
 import numpy as np
 
 from beetle_omni_ros.drivers import servo_guard
-from beetle_omni_ros.drivers import servo_registers as registers
+from beetle_omni_ros.drivers import servo_xc330 as xc330
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.drivers.serial_port import SerialPortError
-from beetle_omni_ros.drivers.servo_link import ServoBusError, ServoLink
-from beetle_omni_ros.drivers.servo_registers import nearest_turns, TURN
-from beetle_omni_ros.model.parameters import JOINT_NAMES
+from beetle_omni_ros.drivers.servo_link import ServoLink
+from beetle_omni_ros.drivers.servo_xc330 import nearest_turns, ServoBusError
 from beetle_omni_ros.model.parts import JointParameters
 from beetle_omni_ros.model.readings import JointReading
 
-# Current, velocity and position have consecutive addresses.
-FEEDBACK, FEEDBACK_LAYOUT = registers.PRESENT_CURRENT.address, struct.Struct('<hii')
-# First register and number of bytes, read in turn from all servos at once. A range has no gap,
-# because a servo may refuse undefined addresses. All lengths differ, because an answer does not
-# contain its address, and a late answer must not be mistaken for another register.
-HEALTH = (registers.TORQUE_ENABLE, 2), (registers.WATCHDOG, 1), (registers.INPUT_VOLTAGE, 4)
-# A value that only a configured servo has: a restart sets the register to its default, 1200. The
-# register has an effect only in velocity mode.
-MARK = (registers.VELOCITY_I, 1201)
-ATTEMPTS = 3            # of reads outside the loop
-TRACKED = 0.2           # [s] half a turn takes longer at the servo's largest speed, 12 rad/s
-WATCHDOG = 0.1          # [s] silence of the bus after which the servos stop
-WATCHDOG_COUNTS = round(WATCHDOG / registers.WATCHDOG_UNIT)
 WATCHDOG_MARGIN = 0.8   # a pause above this share of the watchdog's time may have expired it
 REPEAT_AFTER = 1.0      # [s] until an equal line is logged again
-FIRST_PING = 0.2        # [s] after a reboot; a servo does not answer earlier
 PING_PERIOD = 0.02      # [s]
-BOOT = 2.0              # [s] from a reboot; a servo that is silent for longer has a fault
-SILENT_AFTER = 10       # consecutive missing answers after which a servo is only pinged
 PROBE = 0.1             # [s] between two pings of a silent servo
 HEALTH_PERIOD = 0.1     # [s] in which all health registers are read once
 RECONNECT = 0.2         # [s] between attempts to open a lost port
+DONE = object()         # end of a recovery
 RECOVERIES = 3          # restarts of a servo after overloads; then it stays off
-
-
-@dataclass(slots=True, eq=False)
-class Servo:
-    """State of one servo as last known, NaN or None if unknown."""
-
-    name: str
-    identifier: int
-    sign: int
-    zero: int
-    where: str                          # joint, port and ID, for messages
-    model: int | None = None
-    firmware: int | None = None
-    position: float = float('nan')      # [rad], with the sign of the tilt, as the next two
-    velocity: float = 0.0               # [rad/s]
-    current: float = 0.0                # [A]
-    updated: float = float('-inf')      # monotonic time of the last feedback [s]
-    turns: int = 0                      # to add to its reading
-    turns_known: bool = False
-    misses: int = 0                     # consecutive missing answers
-    silent: bool = False                # after several of them: it is only pinged
-    next_probe: float = 0.0             # monotonic time of the next ping [s]
-    torque: bool | None = None          # whether it has torque
-    error: int = 0                      # Hardware Error Status
-    voltage: float = float('nan')       # [V]
-    temperature: float = float('nan')   # [deg C]
-    recovery: Iterator[None] | None = None      # while it is recovered
-    boot_ends: float = 0.0              # until then it may be silent because of a restart [s]
-    recoveries: int = 0
-    kept_off: bool = False              # it has shut down and stays off until it is rebooted
-
-    def angle(self, counts: int) -> float:
-        """Tilt of a reading without added turns [rad]."""
-        return self.sign * (counts - self.zero) * registers.POSITION_UNIT
-
-    def counts(self, tilt: float) -> int:
-        """Goal for a tilt [rad], in the servo's present frame."""
-        return round(self.zero + self.sign * (tilt - TURN * self.turns) / registers.POSITION_UNIT)
-
-    def update(self, data: bytes, now: float, enabled: bool) -> bool:
-        """Update it from feedback at monotonic ``now`` [s]; return whether it has restarted."""
-        current, velocity, counts = FEEDBACK_LAYOUT.unpack(data)
-        self.current = self.sign * current * registers.CURRENT_UNIT
-        self.velocity = self.sign * velocity * registers.VELOCITY_UNIT
-        angle, before = self.angle(counts), self.turns
-        if enabled or now - self.updated < TRACKED:
-            # A servo cannot move by half a turn between two readings. After a pause without
-            # torque, in which it can be turned by hand, the servo's own count is used.
-            self.turns = nearest_turns(angle, self.position)
-        self.position = angle + TURN * self.turns
-        self.updated, self.misses = now, 0
-        return self.turns != before
-
-    @property
-    def restarting(self) -> bool:
-        """Whether it is silent because of a restart."""
-        return self.silent and time.monotonic() < self.boot_ends
-
-    @property
-    def errors(self) -> tuple[str, ...]:
-        """Hardware errors in words."""
-        return tuple(text for bit, text in registers.HARDWARE_ERRORS.items() if self.error & bit)
-
-    @property
-    def message(self) -> str:
-        """Problem and remedy; '' without a problem."""
-        errors = ', '.join(self.errors)
-        if self.silent and not self.restarting:
-            return f'{self.where}: silent; check its cable and power'
-        if errors and not self.torque:
-            return f'{self.where}: shut down ({errors}); remove the cause, reboot it'
-        return f'{self.where}: {errors}' if errors else ''
-
-
-def make_servos(parameters: ServoBusParameters) -> list[Servo]:
-    """Initial state of the servo of each joint."""
-    return [Servo(name, int(identifier), int(sign), int(zero),
-                  f'{name} ({parameters.port}, id {int(identifier)})')
-            for name, identifier, sign, zero in zip(
-                JOINT_NAMES, parameters.ids, parameters.signs, parameters.zeros, strict=True)]
-
-
-def examine(link: ServoLink, servo: Servo) -> tuple[str, str]:
-    """Read its state into ``servo`` and change nothing; return (problem or '', remedy)."""
-    servo.model = servo.firmware = None
-    try:
-        servo.model = link.ping(servo.identifier, ATTEMPTS)
-        voltage, temperature, servo.error, position, firmware = (
-            link.read(servo.identifier, register, ATTEMPTS) for register in (
-                registers.INPUT_VOLTAGE, registers.TEMPERATURE, registers.HARDWARE_ERROR,
-                registers.PRESENT_POSITION, registers.FIRMWARE))
-    except ServoBusError as error:
-        if servo.model is not None:
-            return str(error), 'check its cable, and whether two servos have this id'
-        return ('does not answer', 'check power, cable, id and baud rate') if link.late \
-            else (str(error), 'reboot it')
-    servo.firmware, servo.temperature = firmware, float(temperature)
-    servo.voltage = voltage * registers.VOLTAGE_UNIT
-    servo.position = servo.angle(position) + TURN * servo.turns
-    if servo.model != registers.MODEL:
-        return (f'model {servo.model}, expected {registers.MODEL} (XC330-T181-T)',
-                'another servo has this id, or ids is wrong')
-    if servo.error:
-        return ', '.join(servo.errors), 'remove the cause, then reboot the servo'
-    return '', ''
 
 
 class ServoBus:
@@ -164,13 +42,13 @@ class ServoBus:
     def __init__(self, parameters: ServoBusParameters, joints: JointParameters,
                  clock: Callable[[], float] = time.time):
         self.parameters, self.travel = parameters, joints.position_limit
-        self.servos = make_servos(parameters)
+        self.servos = xc330.make_servos(parameters)
         self.enabled, self._clock, self.stamp = False, clock, 0.0
         self.link = ServoLink(parameters.port, parameters.baud_rate, parameters.reply_time)
         self._guard: Popen | None = None
-        self._torque_off = registers.TORQUE_ENABLE, {one.identifier: 0 for one in self.servos}
+        self._torque_off = xc330.TORQUE_ENABLE, {one.identifier: 0 for one in self.servos}
         self._next_health = self._next_open = 0.0
-        self._group = 0
+        self._health = cycle(xc330.HEALTH)
         self._events: deque[str] = deque(maxlen=200)    # lines for the log
         self._logged: dict[str, float] = {}
 
@@ -195,20 +73,21 @@ class ServoBus:
         self.disable()
         problems = []
         for servo in self.servos:
-            problem, remedy = examine(self.link, servo)
-            if problem:
-                problems.append(f'{servo.name} (id {servo.identifier}): {problem}; {remedy}')
+            found = xc330.examine(self.link, servo)
+            if found.problem:
+                problems.append(f'{servo.name} (id {servo.identifier}): {found.problem}; '
+                                f'{found.remedy}')
                 continue
             try:
-                self._apply_settings(servo)
+                xc330.configure(self.link, servo, self.parameters, found.firmware)
             except ServoBusError as error:
                 problems.append(f'{servo.name}: {error}')
         if problems:
             raise ServoBusError(f'{self.link.path}: ' + ' | '.join(problems))
         for servo in self.servos:
-            servo.silent, servo.kept_off, servo.misses, servo.recoveries = False, False, 0, 0
+            servo.kept_off, servo.misses, servo.recoveries = False, 0, 0
             servo.torque, servo.error = False, 0
-        self._locate()
+        xc330.locate(self.link, self.servos, self.parameters)
 
     def enable(self):
         """
@@ -216,9 +95,9 @@ class ServoBus:
 
         ServoBusError: an angle is ambiguous, or a servo failed; then none has torque.
         """
-        self._locate()
-        if doubts := registers.settle(self.servos, self.travel):
-            limit = registers.unambiguous_limit(self.travel)
+        xc330.locate(self.link, self.servos, self.parameters)
+        if doubts := xc330.settle(self.servos, self.travel):
+            limit = xc330.unambiguous_limit(self.travel)
             raise ServoBusError(
                 f'{self.link.path}: no torque, the turn is lost: {doubts}; turn it by hand to '
                 f'within +-{limit:.2f} rad, cables untwisted')
@@ -228,7 +107,7 @@ class ServoBus:
         self.enabled = True
         try:
             for servo in self.servos:
-                for register, value in ((registers.WATCHDOG, 0), *self._power_on(
+                for register, value in ((xc330.WATCHDOG, 0), *xc330.power_on(
                         servo.counts(servo.position))):
                     self.link.write(servo.identifier, register, value)
                 servo.torque = True
@@ -240,7 +119,8 @@ class ServoBus:
         """Switch the torque of all servos off; return whether every servo has confirmed it."""
         was_enabled = self.enabled
         self.enabled = False
-        self._drop_recoveries()
+        for servo in self.servos:
+            servo.recovery = None
         if not self.link.is_open:
             return not was_enabled
         confirmed = True
@@ -248,7 +128,7 @@ class ServoBus:
             self.link.sync_write(*self._torque_off)
             for servo in self.servos:
                 try:
-                    self.link.write(servo.identifier, registers.TORQUE_ENABLE, 0)
+                    self.link.write(servo.identifier, xc330.TORQUE_ENABLE, 0)
                     servo.torque = False
                 except ServoBusError as error:
                     confirmed = False
@@ -278,7 +158,7 @@ class ServoBus:
         legal = np.clip(tilt, -self.travel, self.travel)
         try:
             self._feed_watchdog()
-            return self.link.sync_write(registers.GOAL_POSITION, {
+            return self.link.sync_write(xc330.GOAL_POSITION, {
                 servo.identifier: servo.counts(angle)
                 for servo, angle in zip(self.servos, legal, strict=True)})
         except SerialPortError as error:
@@ -294,7 +174,7 @@ class ServoBus:
             asked = sorted((servo for servo in self.servos if not servo.silent),
                            key=lambda servo: servo.misses)
             try:
-                for servo, data in self._sync_read(asked, FEEDBACK, FEEDBACK_LAYOUT.size):
+                for servo, data in self._sync_read(asked, *xc330.FEEDBACK):
                     answered.append(servo)
                     if servo.update(data, now, self.enabled):
                         servo.turns_known &= self.enabled
@@ -311,12 +191,8 @@ class ServoBus:
 
     def reading(self, which: np.ndarray) -> JointReading:
         """Last feedback of the servos ``which`` (4,) bool, NaN if there is none; unwrapped."""
-        chosen = [servo for servo, is_chosen in zip(self.servos, which) if is_chosen]
-        return JointReading(
-            self.stamp, np.array([servo.position for servo in chosen]),
-            np.array([servo.velocity for servo in chosen]),
-            registers.TORQUE_PER_CURRENT * np.array([servo.current for servo in chosen]),
-            [servo.name for servo in chosen])
+        return xc330.reading([servo for servo, is_chosen in zip(self.servos, which) if is_chosen],
+                             self.stamp)
 
     def upkeep(self):
         """
@@ -336,7 +212,7 @@ class ServoBus:
             elif any(servo.silent and now >= servo.next_probe for servo in self.servos):
                 self._probe(now)
             elif now >= self._next_health:
-                self._next_health = now + HEALTH_PERIOD / len(HEALTH)
+                self._next_health = now + HEALTH_PERIOD / len(xc330.HEALTH)
                 self._read_health()
         except SerialPortError as error:
             self._port_lost(error)
@@ -363,7 +239,8 @@ class ServoBus:
         if self.link.is_open:
             self.log(f'{error}; trying again every {RECONNECT:g} s')
         self.link.close()
-        self._drop_recoveries()
+        for servo in self.servos:
+            servo.recovery = None
         self._next_open = time.monotonic() + RECONNECT
 
     def _reconnect(self):
@@ -384,59 +261,16 @@ class ServoBus:
         except SerialPortError:
             self.link.close()
 
-    def _apply_settings(self, servo):
-        link, identifier = self.link, servo.identifier
-        current = round(self.parameters.current_limit / registers.CURRENT_UNIT)
-        permanent = [       # in EEPROM; the mode is first, because it resets the gains
-            (registers.OPERATING_MODE, registers.EXTENDED_POSITION),
-            (registers.DRIVE_MODE, 0), (registers.HOMING_OFFSET, 0), (registers.RETURN_DELAY, 0),
-            (registers.CURRENT_LIMIT, current)]
-        if servo.firmware >= registers.STARTUP_FIRMWARE:
-            permanent.append((registers.STARTUP, 0))    # nothing is restored after power-up
-        servo.turns_known &= self._is_marked(servo)
-        for register in (registers.WATCHDOG, registers.TORQUE_ENABLE):
-            link.write(identifier, register, 0)
-        for register, value in permanent:
-            if link.read(identifier, register, ATTEMPTS) != value:
-                link.write(identifier, register, value)
-        for register, value in self._volatile_settings():
-            link.write(identifier, register, value)
-
-    def _volatile_settings(self):
-        """RAM settings, lost by a restart, except torque and watchdog."""
-        given = self.parameters
-        return [MARK, (registers.STATUS_LEVEL, 2),
-                (registers.POSITION_P, given.position_p_gain),
-                (registers.POSITION_I, given.position_i_gain),
-                (registers.POSITION_D, given.position_d_gain),
-                (registers.PROFILE_ACCELERATION, 0), (registers.PROFILE_VELOCITY, 0)]
-
-    def _is_marked(self, servo):
-        return self.link.read(servo.identifier, MARK[0], ATTEMPTS) == MARK[1]
-
-    def _locate(self):
-        """Read all angles; restarted servos get their RAM settings and have unknown turns."""
-        for servo in self.servos:
-            if not self._is_marked(servo):
-                servo.turns_known = False
-                for register, value in self._volatile_settings():
-                    self.link.write(servo.identifier, register, value)
-            counts = self.link.read(servo.identifier, registers.PRESENT_POSITION, ATTEMPTS)
-            servo.turns *= servo.turns_known
-            servo.position = servo.angle(counts) + TURN * servo.turns
-
     def _feed_watchdog(self):
         """Clear the watchdogs after a pause, because expired ones refuse goals without answer."""
         pause = time.monotonic() - self.link.last_sent
-        if pause > WATCHDOG_MARGIN * WATCHDOG:
+        if pause > WATCHDOG_MARGIN * xc330.WATCHDOG_TIME:
             self._restart_watchdog(self.servos)
 
     def _restart_watchdog(self, servos):
-        for counts in (0, WATCHDOG_COUNTS):
-            self.link.sync_write(registers.WATCHDOG,
+        for counts in (0, xc330.WATCHDOG_COUNTS):
+            self.link.sync_write(xc330.WATCHDOG,
                                   {servo.identifier: counts for servo in servos})
-
-    # --- feedback and health ------------------------------------------------------------------
 
     def _sync_read(self, asked, address, length):
         """Pairs of the servos with a valid answer and their data."""
@@ -447,20 +281,20 @@ class ServoBus:
             if servo.identifier not in answers:
                 continue
             error, data = answers[servo.identifier]
-            if not error & registers.ALERT:
+            if not error & xc330.ALERT:
                 servo.error = 0
             elif not servo.error and servo.recovery is None:
                 servo.kept_off = False
                 self._recover(servo)    # its recovery reads the hardware error
-            if not error & ~registers.ALERT:
+            if not error & ~xc330.ALERT:
                 found.append((servo, data))
         return found
 
     def _count_miss(self, servo):
         """Count a missing answer; after several in a row the servo is silent and only pinged."""
         servo.misses += 1
-        if servo.misses >= SILENT_AFTER and not servo.silent:
-            servo.silent, servo.torque = True, None
+        if servo.misses == xc330.SILENT_AFTER:
+            servo.torque = None
             servo.next_probe = time.monotonic() + PROBE
             self.log(f'{servo.where}: silent; check its cable and power')
 
@@ -478,15 +312,14 @@ class ServoBus:
             self.log(f'{servo.where}: answers again')
             for other in self.servos:
                 other.next_probe = now  # the cause may have been the bus
-        servo.silent, servo.misses, servo.boot_ends = False, 0, 0.0
+        servo.misses, servo.boot_ends = 0, 0.0
         self._recover(servo)
 
     def _read_health(self):
-        register, length = HEALTH[self._group]
-        self._group = (self._group + 1) % len(HEALTH)
+        register, length = next(self._health)
         asked = [servo for servo in self.servos if not servo.silent]
         for servo, data in self._sync_read(asked, register.address, length):
-            if register is registers.TORQUE_ENABLE:
+            if register is xc330.TORQUE_ENABLE:
                 servo.torque = bool(data[0])
                 if self.enabled and not servo.torque and not servo.kept_off:
                     self._recover(servo)
@@ -494,15 +327,13 @@ class ServoBus:
                     # It did not answer when the torque was switched off.
                     self.link.sync_write(register, {servo.identifier: 0})
                     self.log(f'{servo.where}: still had torque, switched off')
-            elif register is registers.WATCHDOG:
-                if data[0] == registers.WATCHDOG_EXPIRED and self.enabled:
+            elif register is xc330.WATCHDOG:
+                if data[0] == xc330.WATCHDOG_EXPIRED and self.enabled:
                     self.log(f'{servo.where}: was stopped by its watchdog, continues')
                     self._restart_watchdog([servo])
             else:
-                servo.voltage = int.from_bytes(data[:2], 'little') * registers.VOLTAGE_UNIT
+                servo.voltage = int.from_bytes(data[:2], 'little') * xc330.VOLTAGE_UNIT
                 servo.temperature = float(data[2])
-
-    # --- recovery -----------------------------------------------------------------------------
 
     def _recover(self, servo, forced=False):
         """Start the recovery of a servo; with ``forced``, restart it in any case."""
@@ -510,16 +341,10 @@ class ServoBus:
             servo.torque = None     # unknown until it is read
             servo.recovery = self._recovery(servo, forced)
 
-    def _drop_recoveries(self):
-        for servo in self.servos:
-            servo.recovery = None
-
     def _recover_step(self, servo):
         try:
-            next(servo.recovery)
-            return
-        except StopIteration:
-            pass
+            if next(servo.recovery, DONE) is not DONE:
+                return
         except ServoBusError as error:
             self.log(f'{servo.name}: {error}')
             if self.link.late:
@@ -537,15 +362,15 @@ class ServoBus:
         """
         link, identifier = self.link, servo.identifier
         if not forced:
-            servo.error = link.read(identifier, registers.HARDWARE_ERROR)
+            servo.error = link.read(identifier, xc330.HARDWARE_ERROR)
             yield
-            servo.torque = bool(link.read(identifier, registers.TORQUE_ENABLE))
+            servo.torque = bool(link.read(identifier, xc330.TORQUE_ENABLE))
             yield
             if servo.torque:
                 return
         if forced or servo.error:
             if not forced and not (self.enabled and servo.recoveries < RECOVERIES
-                                   and not servo.error & registers.OVERHEATING):
+                                   and not servo.error & xc330.OVERHEATING):
                 self.log(f'{servo.where}: shut down ({", ".join(servo.errors)}); it stays off '
                          'until it is rebooted')
                 servo.kept_off = True
@@ -553,14 +378,12 @@ class ServoBus:
             servo.recoveries += 1
             self.log(f'{servo.where}: restarting it')
             link.reboot(identifier)
-            now = time.monotonic()
-            servo.silent = True     # so that reads of the others do not wait for it
-            servo.next_probe, servo.boot_ends = now + FIRST_PING, now + BOOT
+            servo.restarted()
             return
-        for register, value in self._volatile_settings():
+        for register, value in xc330.volatile_settings(self.parameters):
             link.write(identifier, register, value, attempts=1)
             yield
-        counts = link.read(identifier, registers.PRESENT_POSITION)
+        counts = link.read(identifier, xc330.PRESENT_POSITION)
         servo.turns = nearest_turns(servo.angle(counts), servo.position)
         yield
         servo.kept_off = False
@@ -569,13 +392,8 @@ class ServoBus:
             self.log(f'{servo.where}: is back, without torque')
             return
         # The goals of the running loop also use the new turn count.
-        for register, value in self._power_on(counts):
+        for register, value in xc330.power_on(counts):
             yield
             link.write(identifier, register, value, attempts=1)
         servo.torque = True
         self.log(f'{servo.where}: had restarted, is back at {servo.position:+.2f} rad')
-
-    def _power_on(self, counts):
-        """Settings that switch the torque on with a goal, which holds the servo."""
-        return ((registers.GOAL_POSITION, counts), (registers.WATCHDOG, WATCHDOG_COUNTS),
-                (registers.TORQUE_ENABLE, 1))

@@ -8,14 +8,10 @@ from types import SimpleNamespace
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
 
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
-from beetle_omni_ros.drivers.servo_registers import ALERT, Register
+from beetle_omni_ros.drivers.servo_xc330 import ALERT, Register, ServoBusError
 
 RELAXED_REPLY_TIME = 0.02   # [s] time limit of an answer to a request with several attempts
 STATUS_SIZE = 11            # [B] of an answer without data
-
-
-class ServoBusError(RuntimeError):
-    """The bus or a servo failed, or a servo answered with an error; one line with port and ID."""
 
 
 class ServoLink:

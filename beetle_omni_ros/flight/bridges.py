@@ -10,8 +10,8 @@ import numpy as np
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.drivers.motor_board import Arming, FLIES, LOST, MotorBoard
 from beetle_omni_ros.drivers.servo_bus import ServoBus
-from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import ServoLoop
+from beetle_omni_ros.drivers.servo_xc330 import ServoBusError
 from beetle_omni_ros.flight.component import Component, Distribution, ERROR, OK, WARN
 from beetle_omni_ros.model.mode import COMMAND_AGE
 from beetle_omni_ros.model.parameters import JOINT_NAMES, RobotParameters

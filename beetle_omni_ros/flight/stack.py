@@ -203,7 +203,7 @@ class SupervisorComponent(Component):
 
     def select(self, controller: str) -> Answer:
         """Select another controller."""
-        answer = self.supervisor.select(controller, self.host.now())
+        answer = self.supervisor.select(controller)
         self._publish_states()
         return answer
 
@@ -240,7 +240,7 @@ class SupervisorComponent(Component):
             self.step()
 
     def _on_bridge(self, name, text):
-        self.supervisor.inputs.on_actuators(name, text, self.host.now())
+        self.supervisor.inputs.bridges[name] = text
         self.step()
 
     def step(self) -> None:

@@ -6,7 +6,7 @@ from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.drivers.serial_port import SerialPortError
-from beetle_omni_ros.drivers.servo_link import ServoBusError
+from beetle_omni_ros.drivers.servo_xc330 import ServoBusError
 from beetle_omni_ros.flight.bridges import (
     ACTIVE,
     Bridge,

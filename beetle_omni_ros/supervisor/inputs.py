@@ -62,8 +62,9 @@ class Inputs:
         events: what happened, oldest first.
         faults: of this flight: name -> time of detection [s].
         estimate: the last valid one; before the first at the origin, of an infinite age.
-        bridges: bridge 'joint' or 'rotor' -> its reported state; a bridge that never reported has
-            no influence, because without bridges the simulator gets the commands directly.
+        bridges: bridge 'joint' or 'rotor' -> its reported state: 'ready', 'waiting: WHY',
+            'silent: WHY' or 'lost: WHY', set by the caller; a bridge that never reported has no
+            influence, because without bridges the simulator gets the commands directly.
         battery_low, battery_empty, lost: pack below its voltages, robot tumbling or falling, for
             long enough.
         ages: of the estimates, also of refused ones.
@@ -228,14 +229,6 @@ class Inputs:
         if self._now is not None and VOLTAGES[0] <= voltage < VOLTAGES[1]:
             self.voltage = float(voltage)
             self.watch.on_voltage(self._now, self.voltage)
-
-    def on_actuators(self, name: str, text: str, now: float) -> None:
-        """
-        Receive the state of the bridge 'joint' or 'rotor'; the next update acts on it.
-
-        It is 'ready', 'waiting: WHY', 'silent: WHY' or 'lost: WHY'.
-        """
-        self.bridges[name] = text
 
     # What is known ----------------------------------------------------------------------------
 

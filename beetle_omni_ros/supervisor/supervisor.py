@@ -128,7 +128,7 @@ class Supervisor:
             return Answer(True, 'already landing')
         return self._land(now, INFO, 'landing on request')
 
-    def select(self, controller: str, now: float | None = None) -> Answer:
+    def select(self, controller: str) -> Answer:
         """Select another controller; in flight only one with valid commands."""
         if controller == self.active:
             return Answer(True, f'{controller} is active')
@@ -207,9 +207,9 @@ class Supervisor:
             self._watch.restart()
             self._resumed = now
             self._say(WARNING, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: '
-                               'the actuators had stopped')
+                      'the actuators had stopped')
             if self.state == FLYING:
-                self._fall_back(now, WARNING, 'fallback to hover after the pause')
+                self._fall_back(WARNING, 'fallback to hover after the pause')
         # Messages queued during the pause are older. The estimate may be wrong after a fall.
         elif now - self._resumed < RESUMING and not inputs.mocap.silent \
                 and poses[-1][1][2] - inputs.floor < NEAR_GROUND:
@@ -259,8 +259,8 @@ class Supervisor:
             self._land(now, ERROR, *reason)
         elif inputs.lost and self.state == FLYING:
             self._watch.name('control_lost', now)
-            self._fall_back(now, ERROR, f'tumbling or falling under {self.active}_node: fallback '
-                                        'to hover')
+            self._fall_back(ERROR, f'tumbling or falling under {self.active}_node: fallback '
+                                   'to hover')
 
     def _limit_landing(self, now):
         """Limits of a landing, after it had time to recover the robot."""
@@ -300,7 +300,7 @@ class Supervisor:
             if stream.good:
                 self._enter(FLYING, INFO, f'takeoff done: {self.active} flies')
             else:
-                self._fall_back(now, WARNING, f'takeoff done, but {self.active}_node '
+                self._fall_back(WARNING, f'takeoff done, but {self.active}_node '
                                 f'{stream.complaint}: hover waits for it')
         return command
 
@@ -310,7 +310,7 @@ class Supervisor:
             name, text = late or ('controller_silent', f'{self.active}_node {stream.complaint}')
             if late or inputs.ekf.elapsed <= 0.5 * inputs.ekf.limit:    # it answers estimates
                 self._watch.name(name, now)
-            self._fall_back(now, ERROR, f'{text}: fallback to hover')
+            self._fall_back(ERROR, f'{text}: fallback to hover')
             return self._hold(now, dt)
         self.source = self.active
         self._hover.observe(self._seen)
@@ -349,7 +349,7 @@ class Supervisor:
 
     # Changes of state -------------------------------------------------------------------------
 
-    def _fall_back(self, now, severity, text):
+    def _fall_back(self, severity, text):
         """Hover at the present height, in the attitude in which the present turn ends."""
         self._target, self._height = None, float(self.inputs.estimate.position[2])
         self._enter(FALLBACK, severity, text)

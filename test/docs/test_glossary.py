@@ -7,9 +7,6 @@ import re
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / 'beetle_omni_ros'
-# Class -> why two rooms have one of this name.
-TWICE = {
-    'Servo': 'numbers of the model; one servo of the bus with its recovery'}
 
 
 def modules_of_classes():
@@ -35,5 +32,4 @@ def test_each_class_of_the_glossary_exists_where_it_is_said_to_be():
 
 def test_a_class_name_has_one_meaning():
     twice = {name for name, modules in modules_of_classes().items() if len(modules) > 1}
-    assert not twice - TWICE.keys(), 'rename one of each, or add a reason to TWICE'
-    assert not TWICE.keys() - twice, 'no longer twice: delete from TWICE'
+    assert not twice, 'rename one of each'

@@ -7,8 +7,8 @@ import pytest
 pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
+from beetle_omni_ros.drivers.mavlink import BoardStatus
 from beetle_omni_ros.drivers.motor_board import Arming, PATIENCE, STEP
-from beetle_omni_ros.drivers.motor_board_state import BoardStatus
 from beetle_omni_ros.model.mode import Mode
 
 CYCLE = 0.005

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from servo_bench import arrived, bench, COUNT, JOINTS, read, running, until
 
-from beetle_omni_ros.drivers import servo_registers as registers
+from beetle_omni_ros.drivers import servo_xc330 as xc330
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
-from beetle_omni_ros.drivers.servo_link import ServoBusError
+from beetle_omni_ros.drivers.servo_xc330 import ServoBusError
 from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import bind, load_yaml, ParameterError
 from beetle_omni_ros.sim.emulated import servo_bus as table
@@ -91,7 +91,7 @@ def test_impossible_parameters_are_refused(change, text):
 
 
 @pytest.mark.parametrize('register', [
-    value for value in vars(registers).values() if isinstance(value, registers.Register)], ids=str)
+    value for value in vars(xc330).values() if isinstance(value, xc330.Register)], ids=str)
 def test_registers_agree_with_the_table_of_the_emulated_servo(register):
     emulated = table.TABLE[register.name]
     assert (emulated.address, emulated.size, emulated.signed) == register[1:]
@@ -111,10 +111,10 @@ def place(emulated, angles):
 @given(st.floats(-TRAVEL, TRAVEL))
 def test_the_true_angle_is_always_among_the_candidates(angle):
     reading = (angle + pi) % (2 * pi) - pi
-    options = registers.candidates(reading, TRAVEL)
+    options = xc330.candidates(reading, TRAVEL)
     assert any(option == pytest.approx(angle, abs=1e-9) for option in options)
     assert all(abs(option) <= TRAVEL for option in options)
-    assert (len(options) == 1) == (abs(reading) < registers.unambiguous_limit(TRAVEL))
+    assert (len(options) == 1) == (abs(reading) < xc330.unambiguous_limit(TRAVEL))
 
 
 @pytest.mark.real_time

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from servo_bench import arrived, COUNT, read, running, tick, until
 
-from beetle_omni_ros.drivers.servo_bus import RECOVERIES, SILENT_AFTER
+from beetle_omni_ros.drivers.servo_bus import RECOVERIES
+from beetle_omni_ros.drivers.servo_xc330 import SILENT_AFTER
 
 pytestmark = pytest.mark.real_time
 

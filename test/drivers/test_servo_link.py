@@ -4,8 +4,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from beetle_omni_ros.drivers.servo_link import ServoBusError, ServoLink
-from beetle_omni_ros.drivers.servo_registers import GOAL_POSITION, HARDWARE_ERROR, TORQUE_ENABLE
+from beetle_omni_ros.drivers.servo_link import ServoLink
+from beetle_omni_ros.drivers.servo_xc330 import (
+    GOAL_POSITION,
+    HARDWARE_ERROR,
+    ServoBusError,
+    TORQUE_ENABLE,
+)
 from beetle_omni_ros.sim.emulated.servo_bus import packet, sealed, STATUS
 
 

@@ -58,7 +58,7 @@ def perform(rig, action):
     elif kind == 'battery':
         supervisor.inputs.on_battery(rest[0])
     elif kind == 'bridge':
-        supervisor.inputs.on_actuators(*rest, rig.now)
+        supervisor.inputs.bridges[rest[0]] = rest[1]
     elif kind == 'toggle':
         rig.alive ^= {rest[0]}
     elif rest[0] in ('nmpc', 'rl', 'x'):
