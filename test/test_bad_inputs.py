@@ -98,7 +98,7 @@ CASES = {
         ("--controllers ''", "--controllers '': expected"), ('--tasks hovr', 'hovr'),
         ('--controllers npmc', 'npmc'), ('--tasks hover,hover', "--tasks 'hover,hover'"),
         ('--seeds 0,x', "'x'"), ('--seeds -1', "'-1'"), ('--conditions windy', 'windy'),
-        ('--jobs 0', "'--jobs' / '-j': Input should be"), ('--backend threads', 'threads'),
+        ('--jobs 0', "'--jobs' / '-j': Input should be"),
         ('--policy none.onnx', "'none.onnx' does not exist"), ('--output notes.txt', 'notes'),
         ('--json no/result.json', 'there is no folder')],
     FAULTS: [

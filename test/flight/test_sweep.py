@@ -1,4 +1,4 @@
-"""Flights of a comparison: plan, both backends, stored results, failures."""
+"""Flights of a comparison: plan, stored results, failures."""
 
 import io
 import json

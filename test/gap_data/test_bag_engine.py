@@ -11,7 +11,7 @@ from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.body import BodyModel
 from beetle_omni_ros.identify.flights.keys import all_keys, extra_keys
 from beetle_omni_ros.identify.flights.verdict import judged
-from beetle_omni_ros.identify.recording.bag import read_recording
+from beetle_omni_ros.identify.recording.bag import IMU, JOINTS, POSE, read_recording
 from beetle_omni_ros.identify.recording.flight import prepare
 from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -49,9 +49,12 @@ def test_a_late_mocap_is_named_although_it_is_noisy(tmp_path):
 
 def test_a_hidden_effect_is_named_though_the_sensors_differ_from_flight_to_flight(tmp_path):
     rng, made = np.random.default_rng(1), flights(tmp_path, 6, ('rotor_drag', 0.6, 'plain'))
-    made = [replace(flight, pose_t=flight.pose_t + rng.uniform(-0.008, 0.008),
-                    joint_t=flight.joint_t + rng.uniform(-0.008, 0.008),
-                    imu=flight.imu + rng.normal(size=6) * np.repeat([0.05, 0.004], 3))
+    made = [replace(
+        flight,
+        times=flight.times | {topic: flight.times[topic] + rng.uniform(-0.008, 0.008)
+                              for topic in (POSE, JOINTS)},
+        values=flight.values | {IMU: flight.values[IMU] + rng.normal(size=6) * np.repeat(
+            [0.05, 0.004], 3)})
             for flight in made]
     result = judged(made[:2], made[2:], ROBOT, P)
     assert result['verdict'] == 'named' and names(result) == ['rotor_drag']
