@@ -11,7 +11,8 @@ change by at most 0.02 rad (RMS) within 10 ms at the target. Bisection gives the
 and the smallest other value. It assumes that every larger value is not tolerated either.
 
 The linear margins are those of level hover, from the Jacobians of controller and robot, without
-the supervisor, the estimator of the state and noise. `--policy` flies with the controller `rl`.
+the supervisor, the estimator of the state and noise; with `--plants ''` there are no flights.
+`--policy` flies with the controller `rl`. All flights take half an hour of 16 cores.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ CHATTER, ANGLE = 0.02, 2.0      # [rad] of the tilt commands in 10 ms, [deg]: to
 PERIOD, HEIGHT = 0.01, 1.0
 SETTLING, EMPTY, LENGTH = 1000, 40, 300     # steps to the equilibrium, before and after an impulse
 SIZE = 1e-3             # of an impulse [m, m/s, rad, rad/s, N]
+PARTS = 'commands', 'tilts', 'thrusts'
 FREQUENCIES = np.geomspace(0.05, 49.0, 3000)    # [Hz]
 
 
@@ -200,7 +202,7 @@ def linear_margins(controller, options):
     own = np.eye(8) - c[:, :, 16:] * np.exp(-1j * w * PERIOD)[:, None, None]
     loop = np.linalg.solve(own, c[:, :, :16] @ robot_response(advance, x, u))
     rows = {}
-    for name, kept in (('commands', slice(0, 8)), ('tilts', slice(0, 4)), ('thrusts', slice(4, 8))):
+    for name, kept in zip(PARTS, (slice(0, 8), slice(0, 4), slice(4, 8))):
         part = loop[:, kept, kept]
         if name != 'commands':      # the loop of the others is closed
             rest = slice(4, 8) if name == 'tilts' else slice(0, 4)
@@ -248,26 +250,30 @@ def main() -> None:
     parser.add_argument('--json', type=Path)
     chosen = parser.parse_args()
     plants = {name: 'params/robot.yaml' if name == 'robot' else name
-              for name in chosen.plants.split(',')}
+              for name in chosen.plants.split(',') if name}
     names = chosen.controllers.split(',')
     options = {'rl': ControllerOptions(policy=chosen.policy)} if chosen.policy else {}
     linear = [linear_margins(name, options) for name in names]
     cases = [(name, plant, quantity) for quantity in QUANTITIES for plant in plants.values()
              for name in names]
+    console, rows = Console(width=None if sys.stdout.isatty() else 140), []
     with workers(jobs=chosen.jobs):
-        rows = joblib.Parallel(batch_size=1)(joblib.delayed(margin)(*case, chosen)
-                                             for case in cases)
-    console = Console(width=None if sys.stdout.isatty() else 140)
+        for row in joblib.Parallel(batch_size=1, return_as='generator')(
+                joblib.delayed(margin)(*case, chosen) for case in cases):
+            rows.append(row)    # a run takes long: each result at once
+            console.print(f"{row['controller']}, {row['plant']}, {row['quantity']}: {shown(row)}",
+                          markup=False)
     table = Table('quantity', *(f'{name}, {plant}' for plant in plants for name in names))
     for k, quantity in enumerate(QUANTITIES):
         table.add_row(quantity.replace('[', r'\['), *(
             shown(row) for row in rows[k * len(names) * len(plants):][:len(names) * len(plants)]))
-    console.print(table)
+    if plants:
+        console.print(table)
     table = Table('at hover', *(f'{name}, {part}' for name in names
-                                for part in ('commands', 'tilts', 'thrusts')))
+                                for part in PARTS))
     for key in ('delay_ms', 'phase_deg', 'gain', 'gain_down'):
         table.add_row(key, *('–' if row[part][key] is None else f'{row[part][key]:.3g}'
-                             for row in linear for part in ('commands', 'tilts', 'thrusts')))
+                             for row in linear for part in PARTS))
     console.print(table)
     if chosen.json:
         chosen.json.write_text(json.dumps({'meta': {

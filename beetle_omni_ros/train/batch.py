@@ -125,8 +125,8 @@ def sensed(random, s, draw):
     gain = ((1 + ahead / PERIOD) ** 2 + (ahead / PERIOD) ** 2).sqrt()
     rate = motion[:, 3:] + bias[:, 9:12] + scale * gain * draw.around(r.rate_noise, 3)
     tilts = torch.cat((x[:, None, model.TILT], s['past_tilt']), 1)
-    tilt = delayed(tilts, late[:, 1:].clamp(max=PERIOD * s['past_tilt'].shape[1])) + bias[:, 12:16] \
-        + scale * draw.around(r.tilt_noise, 4)
+    age = late[:, 1:].clamp(max=PERIOD * s['past_tilt'].shape[1])
+    tilt = delayed(tilts, age) + bias[:, 12:16] + scale * draw.around(r.tilt_noise, 4)
     return position, rotation, velocity, rate, tilt
 
 

@@ -20,7 +20,8 @@ SINKING_LIMIT = 0.4    # [m] largest penalty, for any depth
 
 def terms(*, position_error, attitude_error, speed, rate, tilt, tilt_rate, previous_tilt_rate,
           thrust, tilt_command, thrust_command, previous_tilt_command, previous_thrust_command,
-          z_axis, target_z_axis, depth, deepest, tilt_limit, thrust_limit) -> dict[str, torch.Tensor]:
+          z_axis, target_z_axis, depth, deepest, tilt_limit, thrust_limit
+          ) -> dict[str, torch.Tensor]:
     """
     Name of ``TERMS`` -> (N,) value without weight, of N robots after one step.
 

@@ -224,7 +224,8 @@ class Starts:
                             d.uniform(1, 0.0, r.jitter)), -1)
         pushed = d.chance(r.push_share)
         extrapolated = d.chance(r.carried_share).float()
-        disturbed = (forced | strong | pushed | (load > 0)).float()
+        # Late robots that oscillate would fill the replays.
+        disturbed = (forced | strong | pushed | (load > 0) | (late[0] + late[1] > 0)).float()
         return {'thrust_limit': d.uniform(1, *self._thrust_limit),
                 'body': torch.cat((total, inertia, centre, actuators, arm, gain), -1),
                 'wrench': wrench,

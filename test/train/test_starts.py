@@ -147,6 +147,8 @@ def test_late_robots_have_their_share_and_range():
         assert 0.98 * most < float(more.max()) <= most + 1e-6
     both = (delays[:, 0] > 1e-6) & (delays[:, 3] > 1e-6)
     assert float(both.float().mean()) == pytest.approx(0.16, abs=0.03)      # independent
+    late = (delays[:, 0] > 1e-6) | (delays[:, 3] > 1e-6)
+    assert torch.equal(env.state['disturbed'][:, 0] > 0.5, late)    # neither judged nor replayed
 
 
 def test_some_servos_have_no_friction():
