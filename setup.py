@@ -86,13 +86,14 @@ TRAIN = [
     'torch>=2.8,<3',
 ]
 
-# Clusters for `beetle_omni compare --backend ray`; 80 MB. Wheels for Python 3.13 begin with 2.45.
-RAY = [
-    'ray>=2.45',
+# flight/gym.py alone.
+GYM = [
+    'gymnasium>=1.0,<2',
 ]
 
 # colcon looks for pytest under the name `test` before it runs pytest.
 TEST = [
+    *GYM,
     'hypothesis>=6.100',
     'mcap-ros2-support>=0.5,<1',     # reads what the package writes
     'onnx>=1.16',
@@ -137,7 +138,7 @@ setup(
         'ros': ROS,
         'hardware': HARDWARE,
         'train': TRAIN,
-        'ray': RAY,
+        'gym': GYM,
         'test': TEST,
         'dev': DEVELOPMENT,
     },

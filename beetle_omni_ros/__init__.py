@@ -92,17 +92,12 @@ def simulation(controller: str | Callable = 'nmpc', *,
         ParameterError, RunError: no take-off, with a message of one line.
 
     """
-    from beetle_omni_ros.bags.log import LogRecorder
-    from beetle_omni_ros.control import registry
-    from beetle_omni_ros.flight.loop import FlightLoop
-    believed, entry = _robot(robot), registry.find(_reference(controller))
-    recorder = LogRecorder({'controller': entry.name})
-    made = FlightLoop(believed, believed if plant is None else _robot(plant),
-                      {entry.name: entry.make(believed)}, recorder, conditions=conditions,
-                      seed=seed)
-    made.recording = recorder.log
-    made.take_off()
-    return made
+    from beetle_omni_ros.flight.evaluate import prepared
+    believed = _robot(robot)
+    loop = prepared(_reference(controller), robot=believed, conditions=conditions, seed=seed,
+                    plant=believed if plant is None else _robot(plant))
+    loop.take_off()
+    return loop
 
 
 def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any = 'waypoints', *,
@@ -163,7 +158,7 @@ def find_gap(runs: Sequence[str | Path], holdout: Sequence[str | Path] = (), *,
     """
     from rich.console import Console
 
-    from beetle_omni_ros.identify.gap.command import gap_results
+    from beetle_omni_ros.identify.flights.command import gap_results
     return gap_results(list(map(_path, runs)), list(map(_path, holdout)), _path(robot),
                        _path(apply), None, _path(report), Console(quiet=quiet), form=form)
 

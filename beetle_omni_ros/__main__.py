@@ -1,4 +1,4 @@
-"""`python -m beetle_omni_ros.cli`."""
+"""`python -m beetle_omni_ros`."""
 
 from beetle_omni_ros.cli import run
 

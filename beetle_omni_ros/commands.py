@@ -153,11 +153,6 @@ def compare(controllers: Annotated[str | None, Option(callback=several, metavar=
             policy: PolicyOption = None,
             plant: PlantOption = None,
             jobs: JobsOption = None,
-            backend: Annotated[str, Option(callback=one_of, metavar='processes|ray', help=(
-                'Run the flights on this computer, or on Ray.'))] = 'processes',
-            address: Annotated[str | None, Option(
-                '--ray-address', metavar='ADDRESS', envvar='RAY_ADDRESS', help=(
-                    'Address of a running cluster. Default: Ray on this computer.'))] = None,
             output: OutputOption = Path('comparison'),
             cache: Annotated[Path | None, Option(metavar='DIR', help=(
                 'Cache of finished flights. Default: .flights in the output.'))] = None,
@@ -291,7 +286,7 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
 
     Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
     """
-    from beetle_omni_ros.identify.gap.command import run_gap
+    from beetle_omni_ros.identify.flights.command import run_gap
     return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
                    tolerances=tolerances, form=form, alpha=alpha)
 

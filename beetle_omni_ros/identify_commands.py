@@ -20,6 +20,11 @@ from beetle_omni_ros.options import (
 identify = Commands(help='Fit the actuator models from measured data.')
 
 
+def _run(what, **options):
+    from beetle_omni_ros.identify.command import run_identify
+    return run_identify(what, **options)
+
+
 @identify.command()
 def joint(paths: Annotated[list[Path], Argument(metavar='LOG...', help=(
               'Response logs (CSV) or recorded run (bag), see docs/how-to/identification.md.'))],
@@ -34,10 +39,7 @@ def joint(paths: Annotated[list[Path], Argument(metavar='LOG...', help=(
 
     Example: beetle_omni identify joint slow.csv --validate fast.csv --report servos.html
     """
-    given = dict(locals())
-    from beetle_omni_ros.bags.bag import runs_in
-    from beetle_omni_ros.identify.command import run_identify_joint
-    run_identify_joint(**{**given, 'paths': runs_in(paths)})
+    _run('joint', **locals())
 
 
 @identify.command()
@@ -57,9 +59,7 @@ def rotor(paths: Annotated[list[Path], Argument(metavar='LOG.csv...', help=(
 
     Example: beetle_omni identify rotor bench.csv --params my_robot.yaml --report rotor.html
     """
-    given = dict(locals())
-    from beetle_omni_ros.identify.command import run_identify_rotor
-    return 3 if run_identify_rotor(**given)['verdict'] == 'bad_data' else 0
+    return 3 if _run('rotor', **locals())['verdict'] == 'bad_data' else 0
 
 
 @identify.command()
@@ -75,6 +75,4 @@ def robot(paths: Annotated[list[Path], Argument(metavar='LOG...', help=(
 
     Example: beetle_omni identify robot slow.csv fast.csv bench.csv --params my_robot.yaml
     """
-    given = dict(locals())
-    from beetle_omni_ros.identify.command import run_identify_robot
-    run_identify_robot(**given)
+    _run('robot', **locals())

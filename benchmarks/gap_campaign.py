@@ -30,7 +30,7 @@ from gap_data.score import markdown, score  # noqa: E402
 
 from beetle_omni_ros.flight.campaign import workers  # noqa: E402
 
-TOOL = f'{sys.executable} -m beetle_omni_ros.cli'
+TOOL = f'{sys.executable} -m beetle_omni_ros'
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:

@@ -26,10 +26,10 @@ from rich.console import Console
 import yaml
 
 from beetle_omni_ros.identify.flights.balance import Balance, SLOW
-from beetle_omni_ros.identify.flights.priors import keys_of
-from beetle_omni_ros.identify.flights.table import Format
-from beetle_omni_ros.identify.flights.table_verdict import load_tables
-from beetle_omni_ros.identify.gap.command import gap_results
+from beetle_omni_ros.identify.flights.command import gap_results
+from beetle_omni_ros.identify.flights.keys import keys_of
+from beetle_omni_ros.identify.flights.verdict import load_tables
+from beetle_omni_ros.identify.recording.table import Format
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import share_path
 

@@ -23,12 +23,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from beetle_omni_ros.identify.gap.apply import effects_with
+from beetle_omni_ros.identify.flights.apply import effects_with
 from beetle_omni_ros.identify.servo import compare as servo_compare
 from beetle_omni_ros.identify.servo.compare import compare, gap_of
-from beetle_omni_ros.identify.servo.joint import identify
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX, simulate
+from beetle_omni_ros.identify.servo.results import identify
 from beetle_omni_ros.model.parameters import RobotParameters
 
 DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'

@@ -47,7 +47,7 @@ FILES = {
                           'The policy of train_published.yaml.'),
     'hover.yaml': ('control.hover:HoverParameters', 'The hover controller.'),
     'ekf.yaml': ('estimation.parameters:EkfParameters', 'The estimator.'),
-    'supervisor.yaml': ('supervisor.parameters:SupervisorParameters',
+    'supervisor.yaml': ('supervisor.interface:SupervisorParameters',
                         'Checks of commands, takeoff, landing, detection of faults.'),
     'targets.yaml': ('control.targets:TargetLimits', 'What a target pose must keep to.'),
     'drive.yaml': ('ros.drive:DriveParameters', 'Driving by hand.'),
@@ -55,7 +55,7 @@ FILES = {
     'motor_board.yaml': ('drivers.device_parameters:MotorBoardParameters',
                          'The motor board.'),
     'simulator.yaml': ('sim.parameters:SimulatorParameters', 'The simulated world.'),
-    'recording.yaml': ('identify.recording.limits:RecordingLimits',
+    'recording.yaml': ('identify.recording.parameters:RecordingLimits',
                        'Limits of the checks of a recording against itself.'),
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
     'train_any.yaml': ('train.parameters:TrainParameters',
@@ -64,7 +64,7 @@ FILES = {
                         'What a training for robots with late commands and joints changes.'),
     'train_published.yaml': ('train.parameters:TrainParameters',
                              'The training with the settings of the publication.'),
-    'gap.yaml': ('identify.gap.parameters:GapParameters', 'The gap finder.')}
+    'gap.yaml': ('identify.recording.parameters:GapParameters', 'The gap finder.')}
 
 ROBOT_FILE = """`mass`, `inertia` and `rotors.positions` are authoritative. With `multibody`, the
 simulated main body is what modules and end-effector leave of them. A file that extends another
@@ -111,9 +111,9 @@ STATUS = """\
 TIMES = """The functions of `import beetle_omni_ros as bo`, which `help` shows too. They need no
 ROS. Short scripts are in `examples/`.
 
-The times of a recorded flight (`bo.read_run`) are absolute, in seconds since 1970-01-01 UTC. Those
-of `bo.simulate` begin at 0. `log.imu_t - log.start` is the time since the start of either. The
-times of a `TrajectoryTarget`, and the argument of `target.at(t)`, are on the same clock.
+The times of a flight are absolute, in seconds since 1970-01-01 UTC; `log.imu.t - log.start` is the
+time since its start. The times of a `TrajectoryTarget`, and the argument of `target.at(t)`, are on
+the same clock.
 """
 
 
@@ -244,8 +244,8 @@ def _wrapped(text: str) -> str:
 
 def effects() -> str:
     """The catalogue of effects."""
-    from beetle_omni_ros.model.catalogue import CONSUMERS, ignored
-    from beetle_omni_ros.model.effects import CATALOGUE
+    from beetle_omni_ros.identify.flights.treatment import TREATMENTS
+    from beetle_omni_ros.model.effects import CATALOGUE, CONSUMERS, ignored
     apart: dict[tuple, list] = {}
     for name in CATALOGUE:
         for key, consumer in CONSUMERS.items():
@@ -253,7 +253,8 @@ def effects() -> str:
                 apart.setdefault((consumer, reason), []).append(f'`{name}`')
     rows = [[f'`{name}`', f'`{key}`', spec.unit, _neutral(spec.neutral),
              f'{_number(spec.low)} to {_number(spec.high)}', 'not fitted' if spec.form
-             else _known(spec.typical), _known(spec.smallest),
+             else _number(TREATMENTS[name].sizes[key].typical),
+             '' if spec.form else _number(TREATMENTS[name].sizes[key].smallest),
              '' if spec.default is None else _neutral(spec.default),
              entry.settings.get(key) and f'`{entry.settings[key]}`' or '',
              '4, one for each ' + entry.each if entry.each
@@ -268,9 +269,10 @@ def effects() -> str:
             'effect](../how-to/add_an_effect.md) shows how\nto add an entry.\n\n'
             + table(['effect', 'layer', 'equation, source', 'acts through', 'shows in',
                      'channels', 'confused with', 'separated by'],
-                    [[f'`{name}`', entry.layer, entry.source, _acts(entry), entry.excited_by,
-                      _channels(entry), ', '.join(f'`{other}`' for other in entry.confused_with),
-                      entry.separated_by] for name, entry in CATALOGUE.items()])
+                    [[f'`{name}`', entry.layer, entry.source, _acts(entry), fit.excited_by,
+                      _channels(fit), ', '.join(f'`{other}`' for other in fit.confused_with),
+                      fit.separated_by] for name, entry in CATALOGUE.items()
+                     for fit in [TREATMENTS[name]]])
             + '\n## Parameters\n\n'
             '*Typical* is a realistic deviation from the neutral value. *Smallest* is the '
             'smallest relevant\ndeviation. If the neutral value is the number of the robot '
@@ -287,28 +289,23 @@ def effects() -> str:
                      for (who, reason), names in sorted(apart.items())]))
 
 
-def _channels(entry) -> str:
+def _channels(fit) -> str:
     names = {'B': 'force and torque', 'J': 'joints', 'A': 'acceleration of the MoCap',
              'W': 'rate of turn of the MoCap'}
-    return ', '.join(names[channel] for channel in entry.channels)
+    return ', '.join(names[channel] for channel in fit.channels)
 
 
 def _acts(entry) -> str:
     ways = {'body': 'the body equations', 'servo': 'the servo equation',
             'number': 'a number of the robot file', 'command': 'the delay of commands',
             'sensor': 'readings', 'feedback': 'readings of the encoders', 'play': 'play'}
-    both = ' and the servo equation' if entry.kind == 'body' and entry.servo else ''
-    return ways[entry.kind] + both
+    return ways[entry.kind]
 
 
 def _neutral(value) -> str:
     values = set(value) if isinstance(value, tuple) else {value}
     one = values.pop()
     return 'robot file' if one != one else _number(one)
-
-
-def _known(value) -> str:
-    return '' if value != value else _number(value)
 
 
 def python() -> str:
@@ -324,7 +321,7 @@ def python() -> str:
         given = [one.replace(annotation=inspect.Parameter.empty) for one in
                  inspect.signature(function).parameters.values() if one.name != 'self']
         text.append(_documented(name, f'bo.{name}{inspect.Signature(given)}', function))
-    for kind in (log.FlightLog, log.Commands, base.PoseTarget, base.TrajectoryTarget,
+    for kind in (log.FlightLog, log.Series, base.PoseTarget, base.TrajectoryTarget,
                  base.Reference):
         text.append(_documented(kind.__name__, kind.__name__, kind))
     return ''.join(text)

@@ -163,14 +163,14 @@ def hardware_flight():
     start = log.targets[0].stamp
     drawn, (left, right) = figure(2)
     for k, colour in enumerate(COLOURS[:4]):
-        left.plot(log.joint_t - start, np.degrees(log.joint_position[:, k]), color=colour,
+        left.plot(log.joint.t - start, np.degrees(log.joint.position[:, k]), color=colour,
                   label=f'gimbal{k + 1}')
-        left.plot(log.command_t - start, np.degrees(log.command_tilt[:, k]), color=colour,
+        left.plot(log.command.t - start, np.degrees(log.command.tilt[:, k]), color=colour,
                   linestyle=':')
     left.legend(ncols=2)
     left.set_xlim(6, 12)
     named(left, 'Tilt, measured (line) and asked for (dots)', 'time [s]', 'angle [deg]')
-    right.plot(log.battery_t - start, log.battery_voltage, color=COLOURS[0])
+    right.plot(log.battery.t - start, log.battery.voltage, color=COLOURS[0])
     named(right, 'Pack', 'time [s]', 'voltage [V]')
     return drawn
 

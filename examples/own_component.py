@@ -11,8 +11,8 @@ force with that of the commanded thrusts, and publishes the difference on 'obser
 
 import numpy as np
 
+from beetle_omni_ros.bags.messages import Wrench
 from beetle_omni_ros.bags.topics import register, topic_like
-from beetle_omni_ros.bags.values import Wrench
 from beetle_omni_ros.flight.component import Component
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.allocation import Allocator

@@ -19,21 +19,21 @@ def summary(bag):
     """Print the contents of a bag, and errors of the position."""
     log = beetle_omni_ros.read_run(bag)
     print(f'{log.end - log.start:.1f} s, task {log.meta.get("task")}, '
-          f'{len(log.imu_t)} IMU samples, {len(log.mocap_t)} poses, {len(log.targets)} targets')
-    print('highest speed', f'{np.linalg.norm(log.odom_velocity, axis=1).max():.2f} m/s,',
-          'largest tilt', f'{np.abs(log.joint_position).max():.2f} rad,',
-          'mean thrust', f'{log.command_thrust.mean():.2f} N')
+          f'{len(log.imu.t)} IMU samples, {len(log.mocap.t)} poses, {len(log.targets)} targets')
+    print('highest speed', f'{np.linalg.norm(log.odom.velocity, axis=1).max():.2f} m/s,',
+          'largest tilt', f'{np.abs(log.joint.position).max():.2f} rad,',
+          'mean thrust', f'{log.command.thrust.mean():.2f} N')
     stamps = [target.stamp for target in log.targets]
-    latest = np.searchsorted(stamps, log.odom_t, side='right') - 1      # -1 before the first
+    latest = np.searchsorted(stamps, log.odom.t, side='right') - 1      # -1 before the first
     error = [np.linalg.norm(position - log.targets[k].at(t).position) for k, t, position
-             in zip(latest, log.odom_t, log.odom_position, strict=True) if k >= 0]
+             in zip(latest, log.odom.t, log.odom.position, strict=True) if k >= 0]
     if error:
         print(f'distance to the target: {1000 * np.median(error):.1f} mm median, '
-              f'{1000 * error[-1]:.1f} mm at {log.odom_t[-1] - log.start:.1f} s')
-    if len(log.truth_t):                        # of simulated flights only
-        truth = np.column_stack([np.interp(log.odom_t, log.truth_t, axis)
-                                 for axis in log.truth_position.T])
-        error = np.linalg.norm(log.odom_position - truth, axis=1)
+              f'{1000 * error[-1]:.1f} mm at {log.odom.t[-1] - log.start:.1f} s')
+    if len(log.truth.t):                        # of simulated flights only
+        truth = np.column_stack([np.interp(log.odom.t, log.truth.t, axis)
+                                 for axis in log.truth.position.T])
+        error = np.linalg.norm(log.odom.position - truth, axis=1)
         print(f'estimated position: {1000 * np.sqrt(np.mean(error ** 2)):.2f} mm RMS')
     for name, asked in log.requests.items():
         print(f'{name} asked for {len(asked.t)} commands')

@@ -98,7 +98,7 @@ def test_report_writes_one_page_that_needs_no_network_also_of_a_truncated_bag(ca
 
 
 @pytest.mark.parametrize(('command', 'folder', 'module', 'remedy'), [
-    ('fly --bag never', 'nodes', 'rclpy', 'beetle_omni_ros[ros]'),
+    ('fly --bag never', 'ros', 'rclpy', 'beetle_omni_ros[ros]'),
     ('train --smoke --output never', 'train', 'torch',
      "run make setup-train in a checkout, or pip install 'beetle_omni_ros[train]'")])
 def test_a_missing_library_is_named_with_its_remedy(capsys, monkeypatch, command, folder, module,

@@ -63,7 +63,7 @@ def test_a_flight_can_be_stepped_by_the_caller():
         loop.step()
     assert np.linalg.norm(loop.simulator.truth.position - [0.2, 0.0, 1.2]) < 0.05
     log = loop.recording()
-    assert log.states[-1].controller == 'hover' and len(log.command_t) > 400
+    assert log.states[-1].controller == 'hover' and len(log.command.t) > 400
 
 
 def test_a_bag_becomes_arrays():

@@ -4,8 +4,8 @@ from dataclasses import fields, is_dataclass
 
 import numpy as np
 
+from beetle_omni_ros.bags.messages import MessageError
 from beetle_omni_ros.bags.topics import ALL
-from beetle_omni_ros.bags.values import MessageError
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.targets import TargetChecks
 from beetle_omni_ros.model.body import BodyState

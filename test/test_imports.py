@@ -15,9 +15,9 @@ ALLOWED = {
     'model': (),
     'control': ('model',),
     'estimation': ('model',),
-    'drivers': ('model', 'bags.values'),
+    'drivers': ('model', 'bags.messages'),
     'sim': ('model', 'drivers.mavlink'),     # framing of the emulated board
-    'supervisor': ('model', 'control.base', 'control.registry'),
+    'supervisor': ('model', 'control.base', 'control.registry', 'estimation.inputs'),
     'bags': ('model', 'control.base', 'control.registry', 'control.tasks'),
     'show': ('model', 'control.base', 'control.tasks', 'bags'),
     'flight': ('model', 'control', 'estimation', 'drivers', 'sim', 'supervisor', 'bags', 'show'),
@@ -38,7 +38,8 @@ ALLOWED = {
 # Library -> the only subpackage that imports it.
 KEPT_IN = {'mujoco': 'sim', 'rclpy': 'ros', 'launch': 'ros', 'torch': 'train',
            'rsl_rl': 'train', 'tensordict': 'train', 'dynamixel_sdk': 'drivers',
-           'pymavlink': 'drivers', 'serial': 'drivers', 'viser': 'show', 'trimesh': 'show'}
+           'pymavlink': 'drivers', 'serial': 'drivers', 'gymnasium': 'flight', 'viser': 'show',
+           'trimesh': 'show'}
 
 
 def imports(path):

@@ -1,7 +1,7 @@
 """Reading of rosbag2 folders (metadata.yaml and MCAP) without ROS, also of truncated files."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 import json
@@ -12,10 +12,10 @@ from mcap.exceptions import InvalidMagic
 from mcap.reader import NonSeekingReader
 import numpy as np
 
-from beetle_omni_ros.bags.bag_types import from_bytes, read_all
 from beetle_omni_ros.bags.conversions import from_nanoseconds
-from beetle_omni_ros.bags.log import FlightLog, LogRecorder, META_KEY, motion, SERIES_OF
-from beetle_omni_ros.bags.topics import ALL, controller_of, TELLING, topic_of, TOPICS
+from beetle_omni_ros.bags.log import FlightLog, LogRecorder, META_KEY, motion
+from beetle_omni_ros.bags.messages import from_bytes
+from beetle_omni_ros.bags.topics import ALL, controller_of, TELLING, Topic, topic_of
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.model.schema import ParameterError, read_yaml
 
@@ -111,7 +111,7 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         ParameterError: no such bag, unreadable, or not MCAP.
 
     """
-    found, broken = 0, ''
+    readable, broken = 0, ''
     for file in bag_files(path):
         count = 0
         try:
@@ -134,8 +134,8 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
                 broken = f'{file.name}: {kind} after {count} readable messages'
                 if warnings is not None:
                     warnings.append(broken)
-        found += count
-    if broken and not found:
+        readable += count
+    if broken and not readable:
         raise ParameterError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
 
 
@@ -158,12 +158,24 @@ def read_together(path: str | Path, warnings: list[str] | None = None
         spaces |= {topic.removesuffix(name).rstrip('/') for topic, _ in groups for name in TELLING
                    if topic.endswith(f'/{name}')}
         if len(spaces) > 1:
-            found = ' and '.join(f"'{space}'" for space in sorted(spaces))
-            raise ParameterError(f'{path}: holds several robots ({found}); expected one')
+            robots = ' and '.join(f"'{space}'" for space in sorted(spaces))
+            raise ParameterError(f'{path}: holds several robots ({robots}); expected one')
         begin = f"{next(iter(spaces), '')}/"
         yield [Recorded('diagnostics' if topic == '/diagnostics' else topic.removeprefix(begin),
                         kind, data, np.array(times))
                for (topic, kind), (data, times) in groups.items()]
+
+
+def read_all(topic: Topic, messages: Sequence[bytes]) -> tuple[list[int], list, Counter]:
+    """Return indices and values of the readable messages, and reason -> number of the others."""
+    rows, values, refused = [], [], Counter()
+    for row, data in enumerate(messages):
+        try:
+            values.append(topic.read(from_bytes(data, topic.type)))
+            rows.append(row)
+        except Exception as error:      # broken bytes raise anything
+            refused[str(error) or type(error).__name__] += 1
+    return rows, values, refused
 
 
 def read_bag(path: str | Path) -> FlightLog:
@@ -180,14 +192,41 @@ def read_bag(path: str | Path) -> FlightLog:
         ParameterError: no such bag, unreadable, not MCAP, or several robots in it.
 
     """
-    reading, warnings = _Reading(), []
+    recorder, warnings = LogRecorder(), []
+    counts: Counter = Counter()
+    unused: dict[str, Counter] = {}     # topic -> reason -> number of messages
     for together in read_together(path, warnings):
         for messages in together:
-            reading.take(messages)
-    reading.recorder.write_meta(_metadata(path, warnings))
-    log = reading.recorder.log()
-    log.warnings, log.source = warnings + reading.problems(), str(path)
+            name = messages.topic
+            if name not in ALL and not controller_of(name):
+                continue
+            topic, refused = topic_of(name), unused.setdefault(name, Counter())
+            if messages.type != topic.type:
+                refused[f'type is {messages.type}, not {topic.type}'] += len(messages.data)
+                continue
+            rows, values, reasons = read_all(topic, messages.data)
+            refused.update(reasons)
+            for row, value in zip(rows, values, strict=True):
+                received = float(messages.received[row])
+                try:
+                    recorder.write(name, _stamped(value, received), received)
+                    counts[name] += 1
+                except ValueError as error:     # a number in the text of a diagnostic value
+                    refused[str(error)] += 1
+    recorder.write_meta(_metadata(path, warnings))
+    log = recorder.log()
+    log.warnings, log.source = warnings + _problems(counts, unused), str(path)
     return log
+
+
+def _problems(counts, unused):
+    """Return a line about missing topics, and one for each topic with unusable messages."""
+    missing = [name for name, topic in ALL.items() if topic.required and not counts[name]]
+    if 'target_pose' in missing and counts['target_trajectory']:
+        missing.remove('target_pose')
+    lines = [f"no message on {', '.join(missing)}"] if missing else []
+    return lines + [f'{name}: {refused.total()} messages not used ({next(iter(refused))})'
+                    for name, refused in unused.items() if refused]
 
 
 def read_flights(paths: Iterable[str | Path], most: int) -> dict[str, FlightLog]:
@@ -208,56 +247,6 @@ def read_flights(paths: Iterable[str | Path], most: int) -> dict[str, FlightLog]
             raise ParameterError('; '.join([f'{path}: no pose of the robot; expected '
                                             'ground_truth/odom or odom', *log.warnings]))
     return logs
-
-
-class _Reading:
-    """Sorts messages by topic into a log, and counts unusable ones."""
-
-    def __init__(self):
-        self.recorder = LogRecorder()
-        self._counts: Counter = Counter()
-        self._bad: Counter = Counter()
-        self._reason: dict[str, str] = {}
-
-    def take(self, messages: Recorded) -> None:
-        """Read messages of one topic; those of a series together."""
-        name = messages.topic
-        if name not in ALL and not controller_of(name):
-            return
-        topic = topic_of(name)
-        if messages.type != topic.type:
-            self._refuse(name, f'type is {messages.type}, not {topic.type}', len(messages.data))
-        elif name in SERIES_OF or controller_of(name):
-            rows, value, refused = read_all(topic, messages.data)
-            if len(rows):
-                received = messages.received[rows]
-                stamp = np.where(value.stamp == 0, received, value.stamp)
-                self.recorder.write(name, replace(value, stamp=stamp), received)
-            self._counts[name] += len(rows)
-            for reason, number in refused.items():
-                self._refuse(name, reason, number)
-        else:
-            for data, received in zip(messages.data, messages.received.tolist(), strict=True):
-                try:
-                    value = topic.read(from_bytes(data, topic.type))
-                    self.recorder.write(name, _stamped(value, received), received)
-                    self._counts[name] += 1
-                except Exception as error:  # must not prevent reading the others
-                    self._refuse(name, str(error) or type(error).__name__)
-
-    def _refuse(self, name, reason, count=1):
-        self._bad[name] += count
-        self._reason.setdefault(name, reason)
-
-    def problems(self) -> list[str]:
-        """Return a line about missing topics, and one for each topic with unusable messages."""
-        missing = [name for name, topic in TOPICS.items()
-                   if topic.required and not self._counts[name]]
-        if 'target_pose' in missing and self._counts['target_trajectory']:
-            missing.remove('target_pose')
-        lines = [f"no message on {', '.join(missing)}"] if missing else []
-        return lines + [f'{name}: {count} messages not used ({self._reason[name]})'
-                        for name, count in self._bad.items()]
 
 
 def _stamped(value, received):

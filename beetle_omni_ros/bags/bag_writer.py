@@ -16,10 +16,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.serde import SerdeError
 import yaml
 
-from beetle_omni_ros.bags.bag_types import from_bytes, new, offered, to_bytes, TYPESTORE
 from beetle_omni_ros.bags.conversions import BODY, nanoseconds, WORLD
 from beetle_omni_ros.bags.log import META_KEY, Recorder
-from beetle_omni_ros.bags.topics import ALL, EVENT, LATCHED, Qos, topic_of, TOPICS
+from beetle_omni_ros.bags.messages import from_bytes, new, offered, to_bytes, TYPESTORE
+from beetle_omni_ros.bags.topics import ALL, EVENT, LATCHED, Qos, topic_of
 from beetle_omni_ros.model.files import write_text
 from beetle_omni_ros.model.schema import ParameterError, read_yaml, RunError
 from beetle_omni_ros.model.urdf import description, links
@@ -99,7 +99,7 @@ class BagWriter(Recorder, AbstractContextManager):
     """
 
     def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
-                 topics: Sequence[str] = tuple(TOPICS), frames: bool = False):
+                 topics: Sequence[str] | None = None, frames: bool = False):
         """
         Create the folder and the bag in it.
 
@@ -107,7 +107,7 @@ class BagWriter(Recorder, AbstractContextManager):
             path: folder to create; it must not exist.
             meta: metadata of the flight: task, conditions, seed, robot, version.
             namespace: namespace of the topics, '' or e.g. '/robot1'.
-            topics: names to declare, see :func:`~beetle_omni_ros.bags.topics.topic_of`.
+            topics: names to declare; default: those of the table.
             frames: whether the description and the frames of the robot are recorded.
 
         Raises:
@@ -123,7 +123,7 @@ class BagWriter(Recorder, AbstractContextManager):
                                              storage_plugin=StoragePlugin.MCAP)
         with self._disk(ParameterError):
             self._writer.open()
-        for name in topics:
+        for name in ALL if topics is None else topics:
             self._declare(self._prefix + name, topic_of(name).type, topic_of(name).qos)
         self._frames = None
         if frames:

@@ -1,21 +1,22 @@
 """
-Conversion between messages and values, by attribute access only.
+Forms of messages: ROS type, class of the value, and conversion between both.
 
-``read_*`` also converts messages of ``read_all``, whose numbers are arrays over N messages, so
-vectors have the shape (N, 3). ``take_joints`` converts one message for use in flight.
+A form is one entry; a topic of :mod:`.topics` has a form.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 import json
 from math import floor, isfinite
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from beetle_omni_ros.bags.bag_types import new
-from beetle_omni_ros.bags.values import Diagnostic, MessageError, Wrench
+from beetle_omni_ros.bags.messages import Diagnostic, MessageError, new, Wrench
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.model import readings, rotations
 from beetle_omni_ros.model.allocation import ActuatorHealth
@@ -29,9 +30,45 @@ COMMAND_NAMES = [*JOINTS, *ROTORS]
 NO_VALUE = [float('nan')] * 4
 UNIT_TOLERANCE = 0.01   # of a quaternion's length; above the rounding of any publisher
 POINTS = 10_000     # of a trajectory: 100 s at 100 Hz; more would block the reading node
-POSE = 'geometry_msgs/msg/PoseStamped'
+STRING = 'std_msgs/msg/String'
+DIAGNOSTICS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 JOINT_STATE = 'sensor_msgs/msg/JointState'
-TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
+TRAJECTORY_TYPE = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
+
+
+class Form(NamedTuple):
+    """
+    One kind of message.
+
+    Attributes:
+        type: ROS message type.
+        value: class of its values.
+        read: message -> value; MessageError for another layout.
+        write: value -> message.
+        take: message -> value for use in flight; MessageError for unusable values.
+
+    """
+
+    type: str
+    value: type
+    read: Callable[[Any], Any]
+    write: Callable[[Any], Any]
+    take: Callable[[Any], Any]
+
+
+def form(name: str, value: type, read: Callable[[Any], Any], write: Callable[[Any], Any],
+         finite: Sequence[str] = ()) -> Form:
+    """Return a form whose ``finite`` attributes are checked in flight; a quaternion is unit."""
+    return Form(name, value, read, write, partial(_checked, read, finite))
+
+
+def _checked(read, names, message):
+    value = read(message)
+    for name in names:
+        check_finite(getattr(value, name), name)
+    if 'quaternion' in names:
+        unit(value.quaternion)
+    return value
 
 
 # --- times, vectors, checks ---------------------------------------------------------------------
@@ -59,13 +96,13 @@ def set_time(time: Any, t: float) -> None:
 
 
 def xyz(v: Any) -> np.ndarray:
-    """Return the three fields as an array (3,) or (N, 3)."""
-    return np.array([v.x, v.y, v.z]).T
+    """Return the three fields as an array (3,)."""
+    return np.array([v.x, v.y, v.z])
 
 
 def xyzw(q: Any) -> np.ndarray:
-    """Return the four fields as an array (4,) or (N, 4)."""
-    return np.array([q.x, q.y, q.z, q.w]).T
+    """Return the four fields as an array (4,)."""
+    return np.array([q.x, q.y, q.z, q.w])
 
 
 def set_parts(v: Any, values: Sequence[float] | np.ndarray) -> None:
@@ -75,7 +112,7 @@ def set_parts(v: Any, values: Sequence[float] | np.ndarray) -> None:
         v.w = float(values[3])
 
 
-def finite(values: np.ndarray | float, what: str) -> None:
+def check_finite(values: np.ndarray | float, what: str) -> None:
     """Raise MessageError if a value is not finite, or its square is not."""
     if not isfinite(np.vdot(values, values)):
         raise MessageError(f'{what} is not finite')
@@ -104,120 +141,110 @@ def _check_frame(message):
 
 # --- messages of vectors ------------------------------------------------------------------------
 
-def vectors(value: type, name: str, frame: str, **places: str
-            ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+def vectors(name: str, value: type, frame: str, *, finite: Sequence[str] | None = None,
+            after_read: Callable[[Any, Any], Any] = lambda value, message: value,
+            after_write: Callable[[Any, Any], None] = lambda message, value: None,
+            **places: str) -> Form:
     """
-    Return ``read`` and ``write`` of a stamped message with vectors at fixed places.
+    Return the form of a stamped message with vectors at fixed places.
 
     Args:
-        value: class of the value, with a ``stamp``.
         name: ROS message type.
+        value: class of the value, with a ``stamp``.
         frame: frame_id.
-        places: attribute of the value -> path of its vector in the message, followed by the names
-            of its parts, 'pose.position xyz'; without parts it is a number.
+        finite: attributes that must be finite in flight; default: all.
+        after_read: (value, message) -> value.
+        after_write: function of (message, value) that fills the rest of the message.
+        **places: attribute of the value -> path of its vector in the message, followed by the
+            names of its parts, 'pose.position xyz'; without parts it is a number.
 
     """
-    found = []      # attribute, path, getter of the vector, getter of its parts
+    vectors_at = []     # attribute, path, getter of the vector, getter of its parts
     for attribute, place in places.items():
         path, _, parts = place.partition(' ')
-        found.append((attribute, path, attrgetter(path), attrgetter(
+        vectors_at.append((attribute, path, attrgetter(path), attrgetter(
             *(f'{path}.{part}' for part in parts)) if parts else None))
 
     def read(message):
-        return value(stamp=seconds(message.header.stamp), **{
-            attribute: np.array(parts(message)).T if parts else whole(message)
-            for attribute, _, whole, parts in found})
+        return after_read(value(stamp=seconds(message.header.stamp), **{
+            attribute: np.array(parts(message)) if parts else whole(message)
+            for attribute, _, whole, parts in vectors_at}), message)
 
     def write(value):
         message = _begin(name, value.stamp, frame)
-        for attribute, path, whole, parts in found:
+        for attribute, path, whole, parts in vectors_at:
             if parts:
                 set_parts(whole(message), getattr(value, attribute))
             else:
                 setattr(message, path, float(getattr(value, attribute)))
+        after_write(message, value)
         return message
 
-    return read, write
+    return form(name, value, read, write, tuple(places) if finite is None else finite)
 
 
-POSE_PLACES = {'position': 'pose.position xyz', 'quaternion': 'pose.orientation xyzw'}
-read_pose, write_pose = vectors(readings.PoseReading, POSE, WORLD, **POSE_PLACES)
-_read_target, write_pose_target = vectors(PoseTarget, POSE, WORLD, **POSE_PLACES)
-read_imu, _write_imu = vectors(
-    readings.ImuReading, 'sensor_msgs/msg/Imu', BODY, specific_force='linear_acceleration xyz',
-    angular_velocity='angular_velocity xyz')
-read_wrench, write_wrench = vectors(Wrench, 'geometry_msgs/msg/WrenchStamped', WORLD,
-                                    force='wrench.force xyz', torque='wrench.torque xyz')
-read_battery, _write_battery = vectors(readings.BatteryReading, 'sensor_msgs/msg/BatteryState', '',
-                                       voltage='voltage', current='current')
-# The twist of the message is in base_link, the velocity of the value in world.
-_read_odom, _write_odom = vectors(
-    BodyState, 'nav_msgs/msg/Odometry', WORLD, position='pose.pose.position xyz',
-    velocity='twist.twist.linear xyz', quaternion='pose.pose.orientation xyzw',
-    angular_velocity='twist.twist.angular xyz')
-
-
-def write_imu(value: readings.ImuReading) -> Any:
-    """Write specific force and angular rates, without orientation (REP-145)."""
-    message = _write_imu(value)
+def _fill_imu(message, value):
+    """State that there is no orientation (REP-145)."""
     message.orientation.w = 1.0
     message.orientation_covariance[0] = -1.0
-    return message
 
 
-def write_battery(value: readings.BatteryReading) -> Any:
-    """Write voltage and current; unmeasured fields are NaN."""
-    message = _write_battery(value)
+def _fill_battery(message, value):
+    """State the kind of the pack; unmeasured fields are NaN."""
     message.temperature = message.charge = message.capacity = message.design_capacity \
         = message.percentage = float('nan')
     message.power_supply_status = message.POWER_SUPPLY_STATUS_DISCHARGING
     message.power_supply_technology = message.POWER_SUPPLY_TECHNOLOGY_LIPO
     message.present = True
-    return message
 
 
-def read_odom(message: Any) -> BodyState:
-    """Read pose and velocity; the velocity is rotated from base_link to world."""
-    odom = _read_odom(message)
-    q, velocity = odom.quaternion, odom.velocity
-    if velocity.ndim == 1:
-        return replace(odom, velocity=rotations.matrix(q) @ velocity)
-    axis, w = q[:, :3], q[:, 3:]
-    swept = 2 * np.cross(axis, velocity)
-    return replace(odom, velocity=velocity + w * swept + np.cross(axis, swept))
+def _in_world(odom, message):
+    """Rotate the velocity from base_link to world."""
+    return replace(odom, velocity=rotations.matrix(odom.quaternion) @ odom.velocity)
 
 
-def write_odom(value: Any) -> Any:
-    """
-    Write pose in world, twist in base_link, and the covariances of an estimate.
-
-    What has no covariances is written without them.
-    """
-    message = _write_odom(value)
+def _fill_odom(message, value):
+    """Write the twist in base_link, and the covariances of an estimate, which the truth lacks."""
     message.child_frame_id = BODY
     set_parts(message.twist.twist.linear, rotations.matrix(value.quaternion).T @ value.velocity)
     for part in ('pose', 'twist'):
         if (covariance := getattr(value, f'{part}_covariance', None)) is not None:
             getattr(message, part).covariance = covariance().reshape(36)
-    return message
 
 
-def read_pose_target(message: Any) -> PoseTarget:
-    target = _read_target(message)
-    finite(target.position, 'position')
+def _as_target(target, message):
+    check_finite(target.position, 'position')
     _check_frame(message)
     return replace(target, quaternion=unit(target.quaternion))
+
+
+POSE = vectors('geometry_msgs/msg/PoseStamped', readings.PoseReading, WORLD,
+               position='pose.position xyz', quaternion='pose.orientation xyzw')
+POSE_TARGET = vectors(POSE.type, PoseTarget, WORLD, after_read=_as_target,
+                      position='pose.position xyz', quaternion='pose.orientation xyzw')
+IMU = vectors('sensor_msgs/msg/Imu', readings.ImuReading, BODY, after_write=_fill_imu,
+              specific_force='linear_acceleration xyz', angular_velocity='angular_velocity xyz')
+WRENCH = vectors('geometry_msgs/msg/WrenchStamped', Wrench, WORLD,
+                 force='wrench.force xyz', torque='wrench.torque xyz')
+BATTERY = vectors('sensor_msgs/msg/BatteryState', readings.BatteryReading, '',
+                  finite=('voltage',), after_write=_fill_battery,
+                  voltage='voltage', current='current')
+# The twist of the message is in base_link, the velocity of the value in world.
+ODOM = vectors('nav_msgs/msg/Odometry', BodyState, WORLD, after_read=_in_world,
+               after_write=_fill_odom, position='pose.pose.position xyz',
+               velocity='twist.twist.linear xyz', quaternion='pose.pose.orientation xyzw',
+               angular_velocity='twist.twist.angular xyz')
 
 
 # --- messages of joints -------------------------------------------------------------------------
 
 def _of(message, field, names):
-    """Values (len(names),) or (N, len(names)) of a field of a JointState, by name."""
+    """Values (len(names),) of a field of a JointState, by name."""
     values = getattr(message, field)
     try:
         order = range(len(names)) if message.name[:len(names)] == names else \
             [message.name.index(name) for name in names]
-        return np.array([values[k] for k in order], dtype=float).T
+        return np.array([values[k] for k in order], dtype=float)
     except ValueError:
         raise MessageError(f"names are not {', '.join(names)}") from None
     except IndexError:
@@ -234,52 +261,45 @@ def _joint_state(stamp, names, **fields):
     return message
 
 
-def read_joints(message: Any) -> readings.JointReading:
+def _read_joints(message):
     return readings.JointReading(
         seconds(message.header.stamp), _of(message, 'position', JOINTS),
         _of(message, 'velocity', JOINTS) if len(message.velocity) else None,
         _of(message, 'effort', JOINTS) if len(message.effort) else None)
 
 
-def take_joints(message: Any) -> readings.JointReading:
+def _take_joints(message):
     """Read the tilt joints for flight: NaN for a joint that is not named, 0 for missing rates."""
     names = [name for name in JOINTS if name in message.name]
     known = [name in names for name in JOINTS]
     position, velocity = np.full((2, 4), np.nan)
     position[known] = _of(message, 'position', names)
     velocity[known] = _of(message, 'velocity', names) if len(message.velocity) else 0.0
-    finite(position[known], 'position')
-    finite(velocity[known], 'velocity')
+    check_finite(position[known], 'position')
+    check_finite(velocity[known], 'velocity')
     return readings.JointReading(seconds(message.header.stamp), position, velocity)
 
 
-def write_joints(value: readings.JointReading) -> Any:
-    return _joint_state(value.stamp, value.names, position=value.position,
-                        velocity=value.velocity, effort=value.effort)
-
-
-def read_rotors(message: Any) -> readings.RotorReading:
-    return readings.RotorReading(seconds(message.header.stamp), _of(message, 'velocity', ROTORS))
-
-
-def write_rotors(value: readings.RotorReading) -> Any:
-    return _joint_state(value.stamp, ROTORS, velocity=value.speed)
-
-
-def read_command(message: Any) -> Command:
+def _read_command(message):
     return Command(seconds(message.header.stamp), _of(message, 'position', JOINTS),
                    _of(message, 'effort', ROTORS))
 
 
-def write_command(value: Command) -> Any:
-    """Write tilts as positions and thrusts as efforts, NaN for unused values."""
-    return _joint_state(value.stamp, COMMAND_NAMES, position=[*value.tilt, *NO_VALUE],
-                        effort=[*NO_VALUE, *value.thrust])
+JOINT = Form(JOINT_STATE, readings.JointReading, _read_joints, lambda value: _joint_state(
+    value.stamp, value.names, position=value.position, velocity=value.velocity,
+    effort=value.effort), _take_joints)
+ROTOR = form(JOINT_STATE, readings.RotorReading, lambda message: readings.RotorReading(
+    seconds(message.header.stamp), _of(message, 'velocity', ROTORS)),
+    lambda value: _joint_state(value.stamp, ROTORS, velocity=value.speed))
+# Tilts are positions and thrusts are efforts; unused values are NaN.
+COMMAND = form(JOINT_STATE, Command, _read_command, lambda value: _joint_state(
+    value.stamp, COMMAND_NAMES, position=[*value.tilt, *NO_VALUE],
+    effort=[*NO_VALUE, *value.thrust]), ('tilt', 'thrust'))
 
 
 # --- trajectories -------------------------------------------------------------------------------
 
-def read_trajectory(message: Any) -> TrajectoryTarget:
+def _read_trajectory(message):
     """Read a trajectory in world; the times of the points count from the header's stamp."""
     start, points = seconds(message.header.stamp), message.points
     if not 2 <= len(points) <= POINTS:
@@ -296,15 +316,15 @@ def read_trajectory(message: Any) -> TrajectoryTarget:
         np.array([xyz(p.velocities[0].angular) for p in points]), stamp=start)
     if np.any(np.diff(path.times) <= 0):
         raise MessageError('trajectory times do not increase')
-    finite(path.positions, 'translation')
-    finite(path.velocities, 'velocity')
-    finite(path.angular_velocities, 'angular velocity')
+    check_finite(path.positions, 'translation')
+    check_finite(path.velocities, 'velocity')
+    check_finite(path.angular_velocities, 'angular velocity')
     return path
 
 
-def write_trajectory(value: TrajectoryTarget) -> Any:
+def _write_trajectory(value):
     """Write a trajectory; angular velocities are in the body frame of the reference."""
-    message = _begin(TRAJECTORY, value.stamp, WORLD)
+    message = _begin(TRAJECTORY_TYPE, value.stamp, WORLD)
     message.joint_names = [BODY]
     for k, time in enumerate(value.times):
         point = new('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
@@ -320,31 +340,23 @@ def write_trajectory(value: TrajectoryTarget) -> Any:
     return message
 
 
-def read_override(message: Any) -> TrajectoryTarget | None:
-    """Read the supervisor's target; None for a message without points."""
-    return read_trajectory(message) if message.points else None
-
-
-def write_override(target: TrajectoryTarget | None) -> Any:
-    return new(TRAJECTORY) if target is None else write_trajectory(target)
+TRAJECTORY = form(TRAJECTORY_TYPE, TrajectoryTarget, _read_trajectory, _write_trajectory)
+# The target of the supervisor is None without points.
+OVERRIDE = form(
+    TRAJECTORY_TYPE, TrajectoryTarget,
+    lambda message: _read_trajectory(message) if message.points else None,
+    lambda value: new(TRAJECTORY_TYPE) if value is None else _write_trajectory(value))
 
 
 # --- text ---------------------------------------------------------------------------------------
 
-read_text: Callable[[Any], str] = attrgetter('data')
-
-
-def read_mode(message: Any) -> Mode:
-    return Mode(message.data)
-
-
-def write_text(value: str) -> Any:
-    message = new('std_msgs/msg/String')
+def _write_text(value):
+    message = new(STRING)
     message.data = value
     return message
 
 
-def read_health(message: Any) -> ActuatorHealth:
+def _read_health(message):
     try:
         health = ActuatorHealth(**{name: tuple(value) if isinstance(value, list) else value
                                    for name, value in json.loads(message.data).items()})
@@ -357,11 +369,7 @@ def read_health(message: Any) -> ActuatorHealth:
     raise MessageError('expected the fields of ActuatorHealth as JSON')
 
 
-def write_health(health: ActuatorHealth) -> Any:
-    return write_text(json.dumps(asdict(health)))
-
-
-def read_diagnostics(message: Any) -> list[Diagnostic]:
+def _read_diagnostics(message):
     """Read all statuses; each gets the message's stamp."""
     t = seconds(message.header.stamp)
     return [Diagnostic(t, status.name, status.level, status.message,
@@ -369,9 +377,9 @@ def read_diagnostics(message: Any) -> list[Diagnostic]:
             for status in message.status]
 
 
-def write_diagnostics(value: Sequence[Diagnostic]) -> Any:
+def _write_diagnostics(value):
     """Write statuses into one message with the stamp of the first."""
-    message = _begin('diagnostic_msgs/msg/DiagnosticArray', value[0].t)
+    message = _begin(DIAGNOSTICS_TYPE, value[0].t)
     for entry in value:
         status = new('diagnostic_msgs/msg/DiagnosticStatus')
         status.level, status.name = int(entry.level), entry.name
@@ -382,3 +390,10 @@ def write_diagnostics(value: Sequence[Diagnostic]) -> Any:
             status.values.append(pair)
         message.status.append(status)
     return message
+
+
+TEXT = form(STRING, str, attrgetter('data'), _write_text)
+MODE = form(STRING, Mode, lambda message: Mode(message.data), _write_text)
+HEALTH = form(STRING, ActuatorHealth, _read_health,
+              lambda health: _write_text(json.dumps(asdict(health))))
+DIAGNOSTICS = form(DIAGNOSTICS_TYPE, Diagnostic, _read_diagnostics, _write_diagnostics)

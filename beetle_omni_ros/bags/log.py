@@ -8,35 +8,34 @@ Times are float seconds on the flight's clock, ROS time in the graph. A loop rec
 
 from __future__ import annotations
 
-from array import array
 from collections import defaultdict
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any, TYPE_CHECKING
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.bags.values import Diagnostic
+from beetle_omni_ros.bags.messages import Diagnostic
 from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.mode import FALLBACK, Mode
 
+_BODY = {'position': 3, 'quaternion': 4, 'velocity': 3, 'angular_velocity': 3}
+_COMMAND = {'received': 0, 'tilt': 4, 'thrust': 4}
 SERIES = {
-    'truth': {'position': 3, 'quaternion': 4, 'velocity': 3, 'angular_velocity': 3},
-    'odom': {'position': 3, 'quaternion': 4, 'velocity': 3, 'angular_velocity': 3},
-    'imu': {'specific_force': 3, 'angular_velocity': 3},
-    'mocap': {'position': 3, 'quaternion': 4},
-    'joint': {'position': 4, 'velocity': 4, 'effort': 4},
-    'battery': {'voltage': 0, 'current': 0},
-    'command': {'received': 0, 'tilt': 4, 'thrust': 4},
-    'wrench': {'force': 3, 'torque': 3},
+    'truth': ('ground_truth/odom', _BODY),
+    'odom': ('odom', _BODY),
+    'imu': ('imu/data_raw', {'specific_force': 3, 'angular_velocity': 3}),
+    'mocap': ('mocap/pose', {'position': 3, 'quaternion': 4}),
+    'joint': ('joint_states', {'position': 4, 'velocity': 4, 'effort': 4}),
+    'battery': ('battery_state', {'voltage': 0, 'current': 0}),
+    'command': ('command', _COMMAND),
+    'wrench': ('disturbance', {'force': 3, 'torque': 3}),
 }
-"""Series -> channel -> width; 0 is a scalar. A log has times ``<series>_t`` and each channel."""
+"""Series of a log -> its topic, and channel -> width, 0 for a scalar."""
 
-SERIES_OF = {'ground_truth/odom': 'truth', 'odom': 'odom', 'imu/data_raw': 'imu',
-             'mocap/pose': 'mocap', 'joint_states': 'joint', 'battery_state': 'battery',
-             'command': 'command', 'disturbance': 'wrench'}
-"""Topic -> series of its values."""
+CHANNELS = dict(SERIES.values())
+"""Topic -> channels of its series."""
 
 META_KEY = 'beetle_omni'    # a flight's metadata in custom_data of metadata.yaml
 COMPUTE_STATUS = 'compute'  # diagnostic status '<name>_node: compute'
@@ -47,45 +46,58 @@ COMPUTE_KEYS = {'median_ms': 'median', 'p99_ms': 'p99', 'max_ms': 'max',
 # [s] tolerance of a window's edges. Stamps are integer nanoseconds in a bag and floats in memory,
 # where UNIX time has a resolution of 0.24 us.
 EDGE = 1e-5
+TOGETHER = 1000     # values that a log converts to rows together
 SAME_TIME = 2.5e-3  # [s] between stamps of an estimate and of the truth that are compared
 
 
-@dataclass
-class Commands:
-    """Commands: t (M,) stamps [s], received (M,) [s], tilt (M, 4) [rad], thrust (M, 4) [N]."""
+class Series(SimpleNamespace):
+    """
+    Values of one topic in the order of their stamps.
+
+    Attributes:
+        t: (N,) stamps [s]; one array of N rows for each channel of SERIES stands beside it.
+
+    """
 
     t: np.ndarray
-    received: np.ndarray
-    tilt: np.ndarray
-    thrust: np.ndarray
+
+    def __len__(self):
+        return len(self.t)
+
+    def window(self, begin: float, end: float) -> slice:
+        """Slice of the samples from ``begin`` to ``end`` [s], both included."""
+        return slice(int(np.searchsorted(self.t, begin - EDGE, side='left')),
+                     int(np.searchsorted(self.t, end + EDGE, side='right')))
+
+    def covers(self, begin: float, end: float, gap: float = 0.1) -> bool:
+        """Whether the first and last sample in the window are within ``gap`` [s] of its edges."""
+        times = self.t[self.window(begin, end)]
+        return len(times) > 0 and times[0] <= begin + gap and times[-1] >= end - gap
 
 
 @dataclass
 class FlightLog:
     """
-    One flight. Every series is sorted by its time; an absent topic is an empty array.
+    One flight. An absent topic is an empty series.
 
     Attributes:
-        truth_t, truth_position, truth_quaternion, truth_velocity, truth_angular_velocity:
-            simulated truth: (N,) [s], (N, 3) in world [m], (N, 4) body to world (x, y, z, w),
-            (N, 3) in world [m/s], (N, 3) in base_link [rad/s].
-        odom_t, odom_position, odom_quaternion, odom_velocity, odom_angular_velocity: the estimate,
-            same channels.
-        imu_t, imu_specific_force, imu_angular_velocity: (N,), (N, 3) [m/s^2], (N, 3) [rad/s].
-        mocap_t, mocap_position, mocap_quaternion: measured poses at their capture times.
-        joint_t, joint_position, joint_velocity, joint_effort: (N, 4) [rad], [rad/s], [N m];
-            effort is NaN where the message had none.
-        battery_t, battery_voltage, battery_current: (N,) [V], [A, negative discharging].
-        command_t, command_received, command_tilt, command_thrust: commands to the actuators:
-            stamp of the answered estimate, time of recording, (M, 4) [rad], (M, 4) [N].
-        wrench_t, wrench_force, wrench_torque: external force in world [N] and torque in
-            base_link [N m], each valid until the next.
+        truth, odom: simulated truth and estimate: ``t`` (N,) [s], ``position`` (N, 3) in world
+            [m], ``quaternion`` (N, 4) body to world (x, y, z, w), ``velocity`` (N, 3) in world
+            [m/s], ``angular_velocity`` (N, 3) in base_link [rad/s].
+        imu: ``specific_force`` (N, 3) [m/s^2], ``angular_velocity`` (N, 3) [rad/s].
+        mocap: measured ``position`` and ``quaternion`` at the times of capture.
+        joint: ``position``, ``velocity``, ``effort`` (N, 4) [rad], [rad/s], [N m]; NaN where the
+            message had none.
+        battery: ``voltage`` [V] and ``current`` [A], negative discharging (N,).
+        command: commands to the actuators: ``t`` stamp of the answered estimate, ``received`` time
+            of recording [s], ``tilt`` (M, 4) [rad], ``thrust`` (M, 4) [N].
+        wrench: external ``force`` in world [N] and ``torque`` in base_link [N m], each valid until
+            the next.
         requests: controller -> its commands, before the supervisor.
         targets: pose and trajectory targets in the order of their stamps.
         state_t, states: (S,) times and the supervisor's states.
-        compute: controller, or another node's name without '_node' -> median, p99, max [ms],
-            deadline_misses, count (cumulative).
-        compute_history: the same names -> list of (t, such a dict), one for each report.
+        compute_history: controller, or another node's name without '_node' -> list of (t, report):
+            median, p99, max [ms], deadline_misses, count (cumulative); ``compute`` has the newest.
         diagnostics: every other status, in the order of time.
         meta: task, conditions, seed, robot, version, if known.
         warnings: problems found while reading, one line each.
@@ -93,20 +105,23 @@ class FlightLog:
 
     """
 
-    requests: dict[str, Commands] = field(default_factory=dict)
-    targets: list[Target] = field(default_factory=list)
-    state_t: np.ndarray = field(init=False)
-    states: list[Mode] = field(default_factory=list)
-    compute: dict[str, dict] = field(default_factory=dict)
-    compute_history: dict[str, list] = field(default_factory=dict)
-    diagnostics: list[Diagnostic] = field(default_factory=list)
-    meta: dict = field(default_factory=dict)
+    truth: Series
+    odom: Series
+    imu: Series
+    mocap: Series
+    joint: Series
+    battery: Series
+    command: Series
+    wrench: Series
+    requests: dict[str, Series]
+    targets: list[Target]
+    state_t: np.ndarray
+    states: list[Mode]
+    compute_history: dict[str, list[tuple[float, dict]]]
+    diagnostics: list[Diagnostic]
+    meta: dict
     warnings: list[str] = field(default_factory=list)
     source: str = ''
-
-    if TYPE_CHECKING:
-        def __getattr__(self, name: str) -> np.ndarray:
-            """Return a channel of SERIES."""
 
     @property
     def begin(self) -> float:
@@ -124,8 +139,13 @@ class FlightLog:
         return max((times[-1] for times in self._times()), default=0.0)
 
     def _times(self):
-        return [times for series in (*SERIES, 'state')
-                if len(times := getattr(self, f'{series}_t'))]
+        return [times for times in (*(getattr(self, name).t for name in SERIES), self.state_t)
+                if len(times)]
+
+    @property
+    def compute(self) -> dict[str, dict]:
+        """Newest report of each entry of ``compute_history``."""
+        return {name: reports[-1][1] for name, reports in self.compute_history.items()}
 
     def controllers(self) -> list[str]:
         """Return the names of the controllers that flew, in this order."""
@@ -134,17 +154,17 @@ class FlightLog:
 
     def named_faults(self) -> dict[str, float]:
         """Return the supervisor's fault names -> time of the first report [s], by time."""
-        found: dict[str, float] = {}
+        named: dict[str, float] = {}
         for t, state in zip(self.state_t, self.states, strict=True):
             if state.fault:
-                found.setdefault(state.fault, float(t))
+                named.setdefault(state.fault, float(t))
         for entry in self.diagnostics:
             if entry.name.endswith(SUPERVISOR_STATUS):
                 for key in entry.values:
                     if key.startswith(FAULT_KEY):
                         name = key.removeprefix(FAULT_KEY)
-                        found[name] = min(found.get(name, entry.t), entry.t)
-        return dict(sorted(found.items(), key=lambda item: item[1]))
+                        named[name] = min(named.get(name, entry.t), entry.t)
+        return dict(sorted(named.items(), key=lambda item: item[1]))
 
     def active_controller(self) -> list[tuple[float, str | None]]:
         """
@@ -171,6 +191,8 @@ class FlightLog:
 class Recorder:
     """Interface of recorders; by itself it passes everything on to others."""
 
+    _others: tuple[Recorder, ...] = ()
+
     def __init__(self, *others: Recorder):
         self._others = others
 
@@ -193,127 +215,101 @@ class Recorder:
         for other in self._others:
             other.write_meta(meta)
 
+    def close(self) -> None:
+        """End the recording."""
+        for other in self._others:
+            other.close()
+
 
 class LogRecorder(Recorder):
     """Collects a :class:`FlightLog`; see there for units and frames."""
 
     def __init__(self, meta: dict | None = None):
-        # topic -> flat rows: hours of flight fit
-        self._rows: dict[str, array] = defaultdict(partial(array, 'd'))
-        self._log = FlightLog(meta=dict(meta or {}))
+        # topic -> its (N, W) rows of stamp and channels, and the values that are no rows yet
+        self._rows: dict[str, list[np.ndarray]] = defaultdict(list)
+        self._pending: dict[str, list] = defaultdict(list)
+        self._targets: list[Target] = []
         self._states: list[tuple[float, Mode]] = []
+        self._history: dict[str, list[tuple[float, dict]]] = defaultdict(list)
+        self._diagnostics: list[Diagnostic] = []
+        self._meta = dict(meta or {})
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
         """Record one value; other topics than those of a log are ignored."""
-        series = SERIES_OF.get(topic) or ('command' if topic.endswith('/command') else '')
-        if not series:
+        if channels_of(topic) is None:
             self._add_event(topic, value, received)
-            return
-        rows, stamp = self._rows[topic], value.stamp
-        parts = [((stamp if received is None else received) if channel == 'received' else
-                  getattr(value, channel), width) for channel, width in SERIES[series].items()]
-        if isinstance(stamp, np.ndarray):       # the fields are arrays over several messages
-            rows.frombytes(np.column_stack([stamp, *(
-                np.full((len(stamp), width), np.nan) if part is None else part
-                for part, width in parts)]).astype(float).tobytes())
-            return
-        row = [stamp]
-        for part, width in parts:
-            if not width:
-                row.append(part)
-            elif isinstance(part, np.ndarray):
-                row += part.tolist()    # floats are added faster than numpy's numbers
-            else:
-                row += [np.nan] * width if part is None else part
-        rows.fromlist(row)
+        else:
+            pending = self._pending[topic]
+            pending.append((value, value.stamp if received is None else received))
+            if len(pending) == TOGETHER:
+                self._add_rows(topic)
+
+    def _add_rows(self, topic):
+        """Convert the pending values of a topic together, which is faster."""
+        values, received = zip(*self._pending.pop(topic), strict=True)
+        columns = [[value.stamp for value in values]]
+        for name, width in channels_of(topic).items():
+            parts = received if name == 'received' else [getattr(value, name) for value in values]
+            columns.append([[np.nan] * width if part is None else part for part in parts])
+        self._rows[topic].append(np.column_stack(columns).astype(float))
 
     def _add_event(self, topic, value, received):
         """Add a target, a state of the supervisor or diagnostics."""
         if topic in ('target_pose', 'target_trajectory'):
-            self._log.targets.append(value)
+            self._targets.append(value)
         elif topic == 'supervisor/state':
             self._states.append((received, Mode(value)))
         elif topic == 'diagnostics':
             for entry in value:
                 node, _, kind = entry.name.rpartition(': ')
-                if kind != COMPUTE_STATUS or not set(COMPUTE_KEYS) <= set(entry.values):
-                    self._log.diagnostics.append(entry)
-                    continue
-                report = {key: int(entry.values[name]) if key in ('deadline_misses', 'count')
-                          else float(entry.values[name]) for name, key in COMPUTE_KEYS.items()}
-                name = node.rpartition('/')[2].removesuffix('_node')
-                self._log.compute[name] = report
-                self._log.compute_history.setdefault(name, []).append((entry.t, report))
+                if kind == COMPUTE_STATUS and set(COMPUTE_KEYS) <= set(entry.values):
+                    name = node.rpartition('/')[2].removesuffix('_node')
+                    self._history[name].append((entry.t, {
+                        key: (int if key in ('deadline_misses', 'count') else float)(
+                            entry.values[given]) for given, key in COMPUTE_KEYS.items()}))
+                else:
+                    self._diagnostics.append(entry)
 
     def write_meta(self, meta: dict) -> None:
         """Add metadata of the flight."""
-        self._log.meta.update(meta)
+        self._meta.update(meta)
 
     def log(self) -> FlightLog:
         """Return the flight so far, each series sorted by time."""
-        log = self._log
-        for topic, series in SERIES_OF.items():
-            for name, values in _columns(self._rows.get(topic, ()), SERIES[series]).items():
-                setattr(log, f'{series}_{name}', values)
-        log.requests = {
-            topic.removesuffix('/command'): Commands(**_columns(rows, SERIES['command']))
-            for topic, rows in self._rows.items() if topic not in SERIES_OF}
         # A latched topic repeats its target: of equal stamps, the last one is kept.
-        log.targets = list({(target.stamp, type(target)): target for target in sorted(
-            log.targets, key=lambda target: target.stamp)}.values())
+        targets = list({(target.stamp, type(target)): target for target in sorted(
+            self._targets, key=lambda target: target.stamp)}.values())
         states = sorted(self._states, key=lambda entry: entry[0])
-        log.state_t = np.array([t for t, _ in states], dtype=float)
-        log.states = [state for _, state in states]
-        log.diagnostics.sort(key=lambda entry: entry.t)
-        return log
+        for topic in list(self._pending):
+            self._add_rows(topic)
+        return FlightLog(
+            **{name: _series(self._rows.get(topic, ()), channels)
+               for name, (topic, channels) in SERIES.items()},
+            requests={topic.removesuffix('/command'): _series(rows, _COMMAND)
+                      for topic, rows in self._rows.items() if topic not in CHANNELS},
+            targets=targets, state_t=np.array([t for t, _ in states], dtype=float),
+            states=[state for _, state in states], compute_history=dict(self._history),
+            diagnostics=sorted(self._diagnostics, key=lambda entry: entry.t), meta=self._meta)
 
 
-def _columns(rows, channels):
-    """'t' and the channels of flat rows, sorted by time."""
+def channels_of(topic: str) -> dict[str, int] | None:
+    """Return the channels of the series of a topic; None for events."""
+    return CHANNELS.get(topic) or (_COMMAND if topic.endswith('/command') else None)
+
+
+def _series(rows, channels):
+    """Sort rows by time into 't' and the channels."""
     widths = {'t': 0, **channels}
     ends = np.cumsum([max(1, width) for width in widths.values()])
-    table = np.array(rows, dtype=float).reshape(-1, ends[-1])
+    table = np.concatenate([np.zeros((0, ends[-1])), *rows])
     table = table[np.argsort(table[:, 0], kind='stable')]
-    return {name: (table[:, end - width:end] if width else table[:, end - 1]).copy()
-            for (name, width), end in zip(widths.items(), ends, strict=True)}
+    return Series(**{name: (table[:, end - width:end] if width else table[:, end - 1]).copy()
+                     for (name, width), end in zip(widths.items(), ends, strict=True)})
 
 
-@dataclass(frozen=True)
-class Motion:
-    """
-    Motion of a body.
-
-    Attributes:
-        t: (N,) [s].
-        position: (N, 3) in world [m].
-        quaternion: (N, 4) body to world (x, y, z, w).
-        velocity: (N, 3) in world [m/s].
-        angular_velocity: (N, 3) in base_link [rad/s].
-
-    """
-
-    t: np.ndarray
-    position: np.ndarray
-    quaternion: np.ndarray
-    velocity: np.ndarray
-    angular_velocity: np.ndarray
-
-    def window(self, begin: float, end: float) -> slice:
-        """Slice of the samples from ``begin`` to ``end`` [s], both included."""
-        return slice(int(np.searchsorted(self.t, begin - EDGE, side='left')),
-                     int(np.searchsorted(self.t, end + EDGE, side='right')))
-
-    def covers(self, begin: float, end: float, gap: float = 0.1) -> bool:
-        """Whether the first and last sample in the window are within ``gap`` [s] of its edges."""
-        times = self.t[self.window(begin, end)]
-        return len(times) > 0 and times[0] <= begin + gap and times[-1] >= end - gap
-
-
-def motion(log: FlightLog) -> Motion:
+def motion(log: FlightLog) -> Series:
     """Return the true motion if it was recorded, else the estimated one."""
-    name = 'truth' if len(log.truth_t) else 'odom'
-    return Motion(*(getattr(log, f'{name}_{channel}') for channel in
-                    ('t', 'position', 'quaternion', 'velocity', 'angular_velocity')))
+    return log.truth if len(log.truth) else log.odom
 
 
 def geodesic_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -332,7 +328,7 @@ def roll_pitch_yaw(quaternions: np.ndarray) -> np.ndarray:
         np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], axis=1))
 
 
-def errors(body: Motion, target: Target, window: slice = slice(None)):
+def errors(body: Series, target: Target, window: slice = slice(None)):
     """
     Compute the errors from a target over the samples of a window.
 
@@ -353,14 +349,14 @@ def estimate_errors(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         (n,) times [s], (n,) position errors [m], (n,) orientation errors [deg].
 
     """
-    if not len(log.truth_t):
+    if not len(log.truth.t):
         return np.zeros(0), np.zeros(0), np.zeros(0)
-    index = np.clip(np.searchsorted(log.truth_t, log.odom_t - SAME_TIME), 0, len(log.truth_t) - 1)
-    near = np.abs(log.truth_t[index] - log.odom_t) < SAME_TIME
+    index = np.clip(np.searchsorted(log.truth.t, log.odom.t - SAME_TIME), 0, len(log.truth.t) - 1)
+    near = np.abs(log.truth.t[index] - log.odom.t) < SAME_TIME
     index = index[near]
-    distance = np.linalg.norm(log.odom_position[near] - log.truth_position[index], axis=1)
-    angle = np.degrees(geodesic_angles(log.odom_quaternion[near], log.truth_quaternion[index]))
-    return log.odom_t[near], distance, angle
+    distance = np.linalg.norm(log.odom.position[near] - log.truth.position[index], axis=1)
+    angle = np.degrees(geodesic_angles(log.odom.quaternion[near], log.truth.quaternion[index]))
+    return log.odom.t[near], distance, angle
 
 
 def reference_poses(target: Target, times: np.ndarray):

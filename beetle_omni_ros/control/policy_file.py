@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.model.catalogue import ignored
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE, ignored
 from beetle_omni_ros.model.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES, value_of
 from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import nest, ParameterError, quoted, shortened

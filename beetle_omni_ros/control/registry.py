@@ -61,7 +61,6 @@ class ControllerEntry:
     flies_degraded: bool = False    # with failed actuators
     stands_by: bool = False     # in the ROS graph
     compared: bool = False  # by default
-    line: tuple[str, str | tuple] = ('', '-')       # colour and dashes in figures
 
     @property
     def reference(self) -> str:
@@ -130,49 +129,45 @@ class ControllerEntry:
         return reach_of(parameters if hasattr(parameters, 'reach') else self.make(robot))
 
 
-# Line styles: blue for RL and red for NMPC as in the publication. The variants are lighter and
-# dashed, so that readers who cannot distinguish the colours can also read the figures.
 _NMPC = 'beetle_omni_ros.control.nmpc:NmpcController'
 _POLICY = 'beetle_omni_ros.control.policy:PolicyController'
 SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
     ControllerEntry(
         name='nmpc', label='NMPC', description='offset-free, params/nmpc.yaml', controller=_NMPC,
         parameters_file='params/nmpc.yaml', option='--nmpc', flies_degraded=True, stands_by=True,
-        compared=True, line=('#c8281e', '-')),
+        compared=True),
     ControllerEntry(
         name='rl', label='RL', description='the learned policy, 33 observations',
         controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
-        option='--policy', stands_by=True, compared=True, line=('#1b5fb4', '-')),
+        option='--policy', stands_by=True, compared=True),
     ControllerEntry(
         name='rl_bare', label='RL, bare', description='the learned policy without guidance',
         controller=_POLICY, parameters_file='params/rl_bare.yaml', policy_file='policies/rl.onnx',
-        compared=True, line=('#0b2d5c', (0, (2, 1)))),
+        compared=True),
     ControllerEntry(
         name='rl_any', label='RL, any robot',
         description='the estimated disturbance as input, trained for robots that differ',
         controller=_POLICY, parameters_file='params/rl_any.yaml',
-        policy_file='policies/rl_any.onnx', line=('#58b4e8', (0, (5, 1.6)))),
+        policy_file='policies/rl_any.onnx'),
     ControllerEntry(
         name='rl_published', label='RL, published training',
         description='params/train_published.yaml, without guidance', controller=_POLICY,
         parameters_file='params/rl_published.yaml', policy_file='policies/rl_published.onnx',
-        compared=True, line=('#3f8f8a', (0, (4, 1, 1, 1)))),
+        compared=True),
     ControllerEntry(
         name='nmpc_corrected', label='NMPC, corrected weight',
         description='params/nmpc_published.yaml with weights.tilt 20 instead of 2',
         controller=_NMPC, parameters_file='params/nmpc_corrected.yaml', flies_degraded=True,
-        compared=True, line=('#b5651d', (0, (5, 1.2)))),
+        compared=True),
     ControllerEntry(
         name='nmpc_published', label='NMPC, published settings',
         description='params/nmpc_published.yaml', controller=_NMPC,
-        parameters_file='params/nmpc_published.yaml', flies_degraded=True, compared=True,
-        line=('#e8960c', (0, (3, 1.2, 1, 1.2)))),
+        parameters_file='params/nmpc_published.yaml', flies_degraded=True, compared=True),
     ControllerEntry(
         name='hover', label='hover PD',
         description="PD with allocation, the supervisor's fallback",
         controller='beetle_omni_ros.control.hover:HoverController',
-        parameters_file='params/hover.yaml', flies_degraded=True,
-        line=('#5b6770', (0, (1, 1.2)))))}
+        parameters_file='params/hover.yaml', flies_degraded=True))}
 DEFAULT = next(iter(SHIPPED))       # the default controller
 STANDING_BY = tuple(name for name, entry in SHIPPED.items() if entry.stands_by)
 COMPARED = sorted((name for name, entry in SHIPPED.items() if entry.compared),
@@ -263,27 +258,27 @@ def find_all(references: Iterable[str]) -> list[ControllerEntry]:
     return list(entries.values())
 
 
-def loaded(reference: str) -> Any:
+def loaded(reference: str, what: str = 'controller') -> Any:
     """Import ``package.module:Name`` or ``path/to/file.py:Name``, also from the working folder."""
     place, _, name = reference.rpartition(':')
     if not place or not name.isidentifier():
-        raise ParameterError(f"controller '{reference}': expected {CLASS}")
+        raise ParameterError(f"{what} '{reference}': expected {CLASS}")
     if place.endswith('.py') and not Path(place).is_file():
-        raise ParameterError(f"controller '{reference}': no such file")
+        raise ParameterError(f"{what} '{reference}': no such file")
     folder = str(Path(place).parent if place.endswith('.py') else Path.cwd())
     if folder not in sys.path:
         sys.path.append(folder)
     try:
         module = _executed(Path(place)) if place.endswith('.py') else import_module(place)
     except ModuleNotFoundError as error:
-        raise ParameterError(f"controller '{reference}': no module '{error.name}'") from None
+        raise ParameterError(f"{what} '{reference}': no module '{error.name}'") from None
     except Exception as error:
-        raise ParameterError(f"controller '{reference}': importing {place} raised "
+        raise ParameterError(f"{what} '{reference}': importing {place} raised "
                              f'{error_text(error)}') from error
     if not hasattr(module, name):
         there = [key for key, value in vars(module).items() if inspect.isclass(value)
                  and value.__module__ == module.__name__]
-        raise ParameterError(f"controller '{reference}': no '{name}' in {place}; its classes: "
+        raise ParameterError(f"{what} '{reference}': no '{name}' in {place}; its classes: "
                              f"{', '.join(there) or 'none'}")
     return getattr(module, name)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from math import inf
 from statistics import fmean, median
 
-from beetle_omni_ros.bags.values import Diagnostic
+from beetle_omni_ros.bags.messages import Diagnostic
 
 OK, WARN, FAIL = 'ok', 'warn', 'fail'
 # Bridge -> page about its faults.

@@ -15,12 +15,11 @@ from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.mavlink import BOARD, common, HOST, MavlinkReceiver, restarted
 from beetle_omni_ros.drivers.motor_board_state import BoardState, RotorStates
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
-from beetle_omni_ros.model.mode import DISARMED, Mode, MOTORS_OFF
+from beetle_omni_ros.model.mode import COMMAND_AGE, DISARMED, Mode, MOTORS_OFF
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.readings import BatteryReading
 from beetle_omni_ros.model.thrust_map import ThrustMap
 
-TARGET_AGE = 0.1        # [s] of the oldest stamp of a target that is sent
 TICK = 0.01             # [s] longest sleep of the thread, a tenth of its shortest period
 CORRECTION = 50_000     # [us] a larger backward step of the board's clock is a restart
 HEARTBEAT_PERIOD = 0.2  # [s] by the contract, as the next three
@@ -183,7 +182,7 @@ class MotorBoard:
         time of the state estimate that they answer [s].
         """
         age = self._clock() - stamp
-        if abs(age) > TARGET_AGE:
+        if abs(age) > COMMAND_AGE:
             return 'stale stamp' if age > 0 else 'stamp in the future'
         if not self.state.clock.known:
             return "offset of the board's clock unknown"

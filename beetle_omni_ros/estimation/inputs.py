@@ -8,7 +8,6 @@ import numpy as np
 
 from beetle_omni_ros.estimation.parameters import EkfParameters, MocapParameters
 from beetle_omni_ros.model import rotations
-from beetle_omni_ros.model.readings import SpikeFilter
 
 Checked = tuple[float, np.ndarray, np.ndarray]   # stamp and two vectors of a sample
 GAP = 0.1           # [s] longest bridged time between two IMU samples
@@ -18,6 +17,11 @@ FORCE_LIMIT, RATE_LIMIT = 160.0, 40.0   # [m/s^2], [rad/s] larger readings are r
 PLACES = 100.0      # [m] largest coordinate of a pose
 DELAY_LIMIT = 0.2   # [s] largest age of a pose against the newest IMU sample
 UNIT = 0.01         # largest deviation of a quaternion's norm from 1
+# Changes of specific force [m/s^2] and rate [rad/s] between two readings that are jumps; full
+# thrust and torque cause 1.4 and 0.5.
+FORCE_JUMP, RATE_JUMP = 30.0, 3.0
+AGREE = 0.5         # squared cosine: two independent errors agree with a probability of 5 %
+LONGEST_HELD = 5    # readings
 
 POSES = 4           # a third difference needs four
 GAIN = 20.0         # variance of the third difference of white noise: 1 + 9 + 9 + 1
@@ -27,6 +31,33 @@ MIN_COUNT = 20      # differences before the first result
 SIGNIFICANT = 2.0   # excess of variance that is unlikely by chance
 EVEN = 0.1          # largest relative difference of equal intervals
 LARGEST_SCALE = 20.0    # of the measured noise to that of the parameters
+
+
+class SpikeFilter:
+    """
+    Rejects outliers of the IMU: a jump is used only if the next reading confirms it.
+
+    An impact pushes again in about the same direction, and the rate that it causes remains. Two
+    independent errors in a row rarely agree in all six axes.
+    """
+
+    def __init__(self):
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._held, self._count = np.zeros(6), 0
+
+    def passes(self, force: np.ndarray, rate: np.ndarray) -> bool:
+        """Whether a reading (3,) [m/s^2], (3,) [rad/s] is used; False holds it back."""
+        if self._last is not None:
+            push, turn = force - self._last[0], rate - self._last[1]
+            if push.dot(push) > FORCE_JUMP**2 or turn.dot(turn) > RATE_JUMP**2:
+                held, self._count = self._held, self._count + 1
+                self._held = jump = np.concatenate([push / FORCE_JUMP, turn / RATE_JUMP])
+                dot = held.dot(jump)
+                agree = dot > 0 and dot**2 >= AGREE * held.dot(held) * jump.dot(jump)
+                if not agree and self._count <= LONGEST_HELD:
+                    return False
+        self._held, self._count, self._last = np.zeros(6), 0, (force, rate)
+        return True
 
 
 class InputGuard:

@@ -12,11 +12,12 @@ from beetle_omni_ros.drivers.motor_board import Arming, FLIES, LOST, MotorBoard
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import ServoLoop
-from beetle_omni_ros.flight.component import COMMAND_AGE, Component, Distribution, ERROR, OK, WARN
+from beetle_omni_ros.flight.component import Component, Distribution, ERROR, OK, WARN
+from beetle_omni_ros.model.mode import COMMAND_AGE
 from beetle_omni_ros.model.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.model.readings import RotorReading
-from beetle_omni_ros.supervisor.events import Answer, INFO, WARNING
-from beetle_omni_ros.supervisor.events import ERROR as SEVERE
+from beetle_omni_ros.supervisor.interface import Answer, INFO, WARNING
+from beetle_omni_ros.supervisor.interface import ERROR as SEVERE
 
 UNCONFIGURED, INACTIVE, ACTIVE = 'unconfigured', 'inactive', 'active'   # states of a lifecycle
 TARGET_PERIOD = 0.005   # [s] of the targets of the board, new or repeated

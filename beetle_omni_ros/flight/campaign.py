@@ -1,13 +1,11 @@
 """
-Many flights: parallel on this computer or on a Ray cluster, each with a file of its result.
+Many flights: parallel, each with a file of its result.
 
 A file belongs to one key: a digest of code, parameters, libraries and everything that was given.
-A repeated campaign flies only the flights without a file. Both backends use joblib with the same
-function and arguments, so that the numbers are equal.
+A repeated campaign flies only the flights without a file.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from functools import cache
 import hashlib
 from importlib import metadata
@@ -17,7 +15,6 @@ import os
 from pathlib import Path
 import platform
 import re
-import warnings
 import zipfile
 
 import joblib
@@ -33,12 +30,10 @@ from beetle_omni_ros.model.schema import ParameterError, RunError
 LIBRARIES = ('casadi', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
 SOURCE = Path(__file__).resolve().parents[1]
 # Folders whose code decides the numbers of a flight and its metrics.
-FLOWN = ('control', 'estimation', 'evaluation', 'messages', 'robot', 'runs', 'safety', 'sim',
-         'stack')
+FLOWN = ('bags', 'control', 'estimation', 'flight', 'model', 'sim', 'supervisor')
+PAGES = ('comparison_page', 'faults', 'summary')     # and code that decides none
 LENGTH = 16  # hexadecimal digits kept of a digest
-OBJECT_STORE = 200 * 2**20  # [byte] shared memory of a local Ray; results are far smaller
-LOST_WORKER = ('TerminatedWorkerError', 'BrokenProcessPool', 'RayActorError', 'ActorDiedError',
-               'OutOfMemoryError')
+LOST_WORKER = 'TerminatedWorkerError', 'BrokenProcessPool'
 
 
 def digest(*parts: str | bytes) -> str:
@@ -59,9 +54,9 @@ def file_digest(path: str | Path) -> str:
 
 @cache
 def code_fingerprint(file: str) -> str:
-    """Digest of libraries, parameters, the folders FLOWN, and the ``file`` that flies them."""
+    """Digest of libraries, parameters, the folders FLOWN without pages, and a flying ``file``."""
     files = [path for folder in FLOWN for path in (SOURCE / folder).rglob('*')
-             if path.suffix in ('.py', '.c', '.h')]
+             if path.suffix in ('.py', '.c', '.h') and path.stem not in PAGES]
     files += [Path(file), *share_path('params').glob('*.yaml')]
     return digest(platform.machine(), *map(str, versions().values()), *(
         part for path in sorted(files, key=lambda path: (path.parent.name, path.name))
@@ -159,8 +154,7 @@ class Store:
 
 
 def sweep(function: Callable[..., dict], calls: Sequence[tuple], *, store: Store | None = None,
-          backend: str = 'processes', jobs: int | None = None, address: str | None = None,
-          console: Console | None = None,
+          jobs: int | None = None, console: Console | None = None,
           line: Callable[[object, dict, bool], str] = lambda flight, result, kept: '',
           ) -> list[dict]:
     """
@@ -171,15 +165,12 @@ def sweep(function: Callable[..., dict], calls: Sequence[tuple], *, store: Store
         calls: its arguments for each flight, in the order of their start; the first is the
             flight, with ``name``, ``key`` and ``cost``, its approximate duration.
         store: store of finished flights; None: nothing is stored.
-        backend: 'processes' or 'ray'.
-        jobs: number of parallel flights; None: one on each core, also of a cluster.
-        address: address of a running Ray cluster; None: a Ray on this computer.
+        jobs: number of parallel flights; None: one on each core.
         console: console for the progress and the lines.
         line: text about a flight from its result and whether it was stored before; '' for none.
 
     Raises:
-        ParameterError: Ray is absent or not reachable.
-        RunError: a worker was killed, or has another version of the code.
+        RunError: a worker was killed.
 
     """
     results: dict[int, dict] = {}
@@ -200,22 +191,22 @@ def sweep(function: Callable[..., dict], calls: Sequence[tuple], *, store: Store
             if store and (known := store.load(call[0])) is not None:
                 done(k, known, True)
         missing = [k for k in range(len(calls)) if k not in results]
-        for at, result in _fly_all(function, [calls[k] for k in missing], backend, jobs, address):
+        for at, result in _fly_all(function, [calls[k] for k in missing], jobs):
             if store:
                 store.save(calls[missing[at]][0], result)
             done(missing[at], result, False)
     return [results[k] for k in range(len(calls))]
 
 
-def _fly_all(function, calls, backend, jobs, address) -> Iterator[tuple[int, dict]]:
+def _fly_all(function, calls, jobs) -> Iterator[tuple[int, dict]]:
     if not calls:
         return
-    code, finished = code_fingerprint(inspect.getfile(function)), 0
+    finished = 0
     try:
-        with workers(backend, jobs, address):
+        with workers(jobs):
             for k, result in joblib.Parallel(return_as='generator_unordered', batch_size=1,
                                              pre_dispatch='all')(
-                    joblib.delayed(_fly_one)(k, code, function, call)
+                    joblib.delayed(_fly_one)(k, function, call)
                     for k, call in enumerate(calls)):
                 finished += 1
                 yield k, result
@@ -228,60 +219,10 @@ def _fly_all(function, calls, backend, jobs, address) -> Iterator[tuple[int, dic
             'memory') from None
 
 
-def _fly_one(k, code, function, call):
-    if code_fingerprint(inspect.getfile(function)) != code:
-        raise RunError(f'{platform.node()} has another version of the code or its parameters '
-                       'than the computer that started the flights')
+def _fly_one(k, function, call):
     return k, function(*call)
 
 
-@contextmanager
-def workers(backend: str = 'processes', jobs: int | None = None, address: str | None = None):
+def workers(jobs: int | None = None):
     """Configure joblib with one thread for the numerical libraries of each worker."""
-    if backend == 'processes':
-        with joblib.parallel_config('loky', n_jobs=jobs or -1, inner_max_num_threads=1):
-            yield
-        return
-    ray = _start_ray(jobs, address)
-    # At least two workers if available, because joblib runs a single job in this process.
-    cores = int(ray.cluster_resources().get('CPU', 1))
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter('ignore')  # Ray warns about its own future
-            with joblib.parallel_config('beetle_omni_ray',
-                                        n_jobs=min(max(2, jobs or cores), cores)):
-                yield
-    finally:
-        ray.shutdown()
-
-
-def _start_ray(jobs, address):
-    os.environ.setdefault('RAY_USAGE_STATS_ENABLED', '0')
-    os.environ.setdefault('RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO', '0')
-    try:
-        import ray
-        from ray.util.joblib import register_ray
-        from ray.util.joblib.ray_backend import RayBackend
-    except ImportError:
-        raise ParameterError("--backend ray: the module 'ray' is not installed; pip install "
-                             "'beetle_omni_ros[ray]' brings it") from None
-
-    class Backend(RayBackend):
-        """Ray's backend, with the callbacks that joblib's generators need."""
-
-        supports_return_generator = True
-
-    register_ray()
-    joblib.register_parallel_backend('beetle_omni_ray', Backend)
-    quiet = {'logging_level': 'ERROR', 'log_to_driver': False}
-    try:
-        if address:
-            ray.init(address=address, **quiet)
-        else:
-            ray.init(address='local', num_cpus=max(2, jobs or joblib.cpu_count()),
-                     include_dashboard=False, object_store_memory=OBJECT_STORE, **quiet)
-    except (ConnectionError, OSError, RuntimeError, ValueError) as error:
-        text = ' '.join(str(error).split())[:200]
-        raise ParameterError(f"--backend ray: cannot use the cluster at '{address or 'local'}' "
-                             f'({text})') from None
-    return ray
+    return joblib.parallel_config('loky', n_jobs=jobs or -1, inner_max_num_threads=1)

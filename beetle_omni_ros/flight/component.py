@@ -9,7 +9,7 @@ one process (:mod:`.loop`) and a ROS node (:class:`beetle_omni_ros.ros.node.Flig
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 import math
 import time
@@ -17,59 +17,57 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from beetle_omni_ros.bags.messages import Diagnostic, MessageError
 from beetle_omni_ros.bags.topics import Qos
-from beetle_omni_ros.bags.values import Diagnostic, MessageError
-from beetle_omni_ros.supervisor.events import Answer
-from beetle_omni_ros.supervisor.supervisor import AGE_LIMIT
+from beetle_omni_ros.control.registry import loaded, snake_case
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.supervisor.interface import Answer
 
 OK, WARN, ERROR = range(3)      # of diagnostic_msgs/DiagnosticStatus
 DIAGNOSTICS_PERIOD = 1.0        # [s] between two reports of a component
 SILENCE = 0.5           # [s] without a message after which an expected topic has ended
 FUTURE = 0.05           # [s] ahead of the clock above which a stamp is refused
-COMMAND_AGE = AGE_LIMIT     # [s] no older command is executed, by any actuator
 IDENTITY = 'supervisor/identity'
 TEXT_LIMIT = 40         # characters of a foreign identity in an error message
 
 
 class Distribution:
-    """Quantiles of durations in constant memory: a histogram with 2 % wide bins."""
+    """
+    Quantiles of durations in constant memory: a histogram with 2 % wide bins.
+
+    Attributes:
+        count: number of durations.
+        max: longest duration [s]; 0 without one.
+
+    """
 
     EDGES = 1e-6 * 1.02 ** np.arange(1000)      # [s], up to 400 s
     PENDING = 1000      # durations that wait to be counted together, which is faster
 
     def __init__(self):
+        self.count, self.max = 0, 0.0
         self._counts = np.zeros(len(self.EDGES) + 1, dtype=np.int64)
-        self._max, self._pending = 0.0, []
+        self._pending: list[float] = []
 
     def add(self, seconds: float) -> None:
         """Count one duration [s]."""
+        self.count, self.max = self.count + 1, max(self.max, seconds)
         self._pending.append(seconds)
         if len(self._pending) == self.PENDING:
-            self._count()
+            self._fill()
 
-    def _count(self):
-        if self._pending:
-            np.add.at(self._counts, np.searchsorted(self.EDGES, self._pending, 'right'), 1)
-            self._max = max(self._max, *self._pending)
-            self._pending.clear()
-
-    @property
-    def count(self) -> int:
-        """Number of durations."""
-        return int(self._counts.sum()) + len(self._pending)
-
-    @property
-    def max(self) -> float:
-        """Longest duration [s]; 0 without one."""
-        return max([self._max, *self._pending])
+    def _fill(self):
+        np.add.at(self._counts, np.searchsorted(self.EDGES, self._pending, 'right'), 1)
+        self._pending.clear()
 
     def quantile(self, fraction: float) -> float:
         """Return a quantile [s], up to 2 % too large; NaN if nothing was counted."""
-        self._count()
         if not self.count:
             return float('nan')
+        self._fill()
         k = int(np.searchsorted(np.cumsum(self._counts), fraction * self.count))
-        return float(min(self.EDGES[k] if k < len(self.EDGES) else self._max, self._max))
+        return float(min(self.EDGES[k] if k < len(self.EDGES) else self.max, self.max))
 
     def status(self, text: str, level: int = OK, **more: float) -> tuple[int, str, dict]:
         """Return median, 99th percentile, maximum [ms] and number as a diagnostic status."""
@@ -145,7 +143,7 @@ class Host(Protocol):
         """Carry a value to the readers of its topic; ``source`` identifies a supervisor."""
 
     def log(self, severity: str, text: str) -> None:
-        """Log a line, with a severity of :mod:`~beetle_omni_ros.supervisor.events`."""
+        """Log a line, with a severity of :mod:`~beetle_omni_ros.supervisor.interface`."""
 
     def warn(self, kind: str, text: str) -> None:
         """Log a warning; the host may leave out repetitions of a kind."""
@@ -241,12 +239,12 @@ class Component:
         if not entry.stamped:
             entry.handle(value)
             return
-        host, limit = self.host, entry.max_age
+        host = self.host
         age = host.now() - value.stamp
         try:
-            if self._identity and topic == 'command':
+            if topic == 'command':
                 self._check_source(source)
-            if limit is not None and not -FUTURE <= age <= limit:
+            if (limit := entry.max_age) is not None and not -FUTURE <= age <= limit:
                 raise MessageError('stale stamp' if age > 0 else 'stamp in the future')
             if published is None:
                 entry.handle(value)
@@ -282,7 +280,7 @@ class Component:
         those with the newest identity.
         """
         identity = self._identity
-        if source != identity:
+        if identity and source != identity:
             name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'
             raise MessageError(
                 f"2nd publisher: frame_id has {name}, expected '{identity[:TEXT_LIMIT]}'",
@@ -305,7 +303,9 @@ class Component:
     # Health -----------------------------------------------------------------------------------
 
     def timed(self, function: Callable, *args):
-        """Call ``function`` and count its CPU time."""
+        """Call ``function`` and, in real time, count its CPU time."""
+        if self.host.simulated:
+            return function(*args)
         begin = time.thread_time()
         result = function(*args)
         self.took(time.thread_time() - begin)
@@ -325,6 +325,8 @@ class Component:
         """All statuses of this component."""
         statuses = []
         for part, source in self._reports:
+            if part == 'compute' and not self._compute.count:
+                continue
             level, text, values = source()
             statuses.append(Diagnostic(
                 self.host.now(), f'{self.name}: {part}', level, text,
@@ -354,3 +356,29 @@ class Component:
                 faults.append(f'waiting for {topic}')
             entry.reported, entry.rejected_reported = entry.received, count
         return level, '; '.join(faults) or 'all arriving', values
+
+
+# --- components of others ----------------------------------------------------------------------
+
+def component_class(reference: str) -> type[Component]:
+    """
+    Load a subclass of Component, whose constructor takes the robot.
+
+    Raises:
+        ParameterError: there is none at ``reference``, 'FILE.py:Class' or 'package.module:Class'.
+
+    """
+    kind = loaded(reference, 'component')
+    if not (isinstance(kind, type) and issubclass(kind, Component)):
+        raise ParameterError(f"component '{reference}': {kind!r} is no subclass of Component")
+    return kind
+
+
+def node_name(kind: type[Component]) -> str:
+    """Name of the node of a component: 'wrench_observer_node' of WrenchObserver."""
+    return f'{snake_case(kind.__name__)}_node'
+
+
+def made(references: Iterable[str], robot: RobotParameters) -> list[Component]:
+    """Components of references; their topics are those of the table or registered ones."""
+    return [component_class(reference)(robot) for reference in references]

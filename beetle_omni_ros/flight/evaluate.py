@@ -1,7 +1,7 @@
 """`beetle_omni evaluate`: flies tasks in one process with one or several controllers."""
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import closing, ExitStack
 from pathlib import Path
 import signal
 import threading
@@ -20,54 +20,77 @@ from beetle_omni_ros.control.base import Controller, guidance_of, reach_of
 from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.control.targets import check_steps
 from beetle_omni_ros.control.tasks import make_task, Task
+from beetle_omni_ros.flight.component import made
 from beetle_omni_ros.flight.loop import FlightLoop
-from beetle_omni_ros.flight.plugin import made
 from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.show import table
-from beetle_omni_ros.sim.fault_lists import load_faults
-from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.faults import Fault, load_faults
 
 
-def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,
-        conditions: str = 'nominal', seed: int = 0,
-        options: Mapping[str, ControllerOptions] = MappingProxyType({}),
-        built: Controller | None = None, bag: Path | None = None, meta: dict | None = None,
-        faults: Sequence[Fault] = (), actuators: str = 'direct', components: Sequence[str] = (),
-        progress: Callable[..., None] | None = None) -> FlightLog:
+def prepared(controller: str, *, robot: RobotParameters, plant: RobotParameters,
+             conditions: str = 'nominal', seed: int = 0,
+             options: Mapping[str, ControllerOptions] = MappingProxyType({}),
+             built: Controller | None = None, pilot: bool = False, bag: Path | None = None,
+             meta: dict | None = None, faults: Sequence[Fault] = (), actuators: str = 'direct',
+             components: Sequence[str] = ()) -> FlightLoop:
     """
-    Fly one task with one controller, a name or a reference to a class; ``built`` is that one.
+    Return a robot on the ground with its flight stack; close it after the flight.
 
-    Other arguments are those of :func:`run_evaluate`. The flight is returned after a crash, too
-    (``meta['crashed']``), or an interruption by ``progress`` (``meta['interrupted']``).
-    ParameterError: a pose of the task is beyond the controller's reach.
+    ``controller`` is a name or a reference to a class, ``built`` that one. With ``pilot`` the
+    controller is aboard that lands a robot with a lost actuator. The flight is recorded in memory
+    with ``meta``, and in a new folder ``bag``. Other arguments are those of :func:`run_evaluate`.
+
     """
     entry = registry.find(controller)
     flying = built or entry.make(robot, options.get(entry.reference, ControllerOptions()))
     aboard = {entry.name: flying}
-    if faults:  # with a lost actuator the pilot lands the robot, whatever controller is active
-        pilot = registry.find(registry.pilot())
-        aboard.setdefault(pilot.name, flying if pilot == entry else pilot.make(
-            robot, options.get(pilot.reference, ControllerOptions())))
-    if task.kind == 'poses':
-        check_steps(task.poses, reach_of(flying), lambda k: f"task '{task.name}': pose {k + 1}")
-    meta = dict(meta or {}, controller=entry.name, guidance=guidance_of(flying))
+    if pilot:
+        other = registry.find(registry.pilot())
+        aboard.setdefault(other.name, flying if other == entry else other.make(
+            robot, options.get(other.reference, ControllerOptions())))
+    meta = {**(meta or {}), 'controller': entry.name, 'guidance': guidance_of(flying)}
     memory = LogRecorder(meta)
+    kind: type[FlightLoop] = FlightLoop
+    if actuators == 'emulated':
+        from beetle_omni_ros.flight.real_time import EmulatedLoop  # has serial ports
+        kind = EmulatedLoop
     with ExitStack() as stack:
-        recorder: Recorder = memory
+        others = made(components, robot)    # before the bag, which a mistake would leave behind
+        recorders: list[Recorder] = [memory]
         if bag is not None:
             from beetle_omni_ros.bags.bag_writer import BagWriter
-            recorder = Recorder(memory, stack.enter_context(BagWriter(
+            recorders.append(stack.enter_context(BagWriter(
                 bag, meta=meta, topics=tuple(topics_with([entry.name])), frames=True)))
-        kind: type[FlightLoop] = FlightLoop
-        if actuators == 'emulated':
-            from beetle_omni_ros.flight.real_time import EmulatedLoop  # has serial ports
-            kind = EmulatedLoop
-        flight = kind(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
-                      faults=faults, epoch=int(time()), others=made(components, robot))
-        stack.callback(flight.close)
-        flight.fly(task, progress)
-    return memory.log()
+        loop = kind(robot, plant, aboard, Recorder(*recorders), conditions=conditions, seed=seed,
+                    faults=faults, epoch=int(time()), others=others)
+        loop.recording = memory.log
+        stack.pop_all()     # the loop closes its recorder
+    return loop
+
+
+def fly(controller: str, task: Task, *, robot: RobotParameters,
+        options: Mapping[str, ControllerOptions] = MappingProxyType({}),
+        built: Controller | None = None, faults: Sequence[Fault] = (),
+        progress: Callable[..., None] | None = None, **given) -> FlightLog:
+    """
+    Fly one task with one controller; arguments as of :func:`prepared`.
+
+    The flight is returned after a crash, too (``meta['crashed']``), or an interruption by
+    ``progress`` (``meta['interrupted']``).
+
+    Raises:
+        ParameterError: a pose of the task is beyond the controller's reach.
+
+    """
+    entry = registry.find(controller)
+    built = built or entry.make(robot, options.get(entry.reference, ControllerOptions()))
+    if task.kind == 'poses':
+        check_steps(task.poses, reach_of(built), lambda k: f"task '{task.name}': pose {k + 1}")
+    with closing(prepared(controller, robot=robot, options=options, built=built,
+                          pilot=bool(faults), faults=faults, **given)) as loop:
+        loop.fly(task, progress)
+        return loop.recording()
 
 
 def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 'nominal',

@@ -6,30 +6,23 @@ A flight is judged from the true motion and the commanded thrust alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from time import time
 from zlib import crc32
 
 import numpy as np
 
-from beetle_omni_ros.bags.bag_writer import BagWriter
-from beetle_omni_ros.bags.log import Recorder
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.control.tasks import random_poses
+from beetle_omni_ros.control.tasks import pose_target, random_poses
 from beetle_omni_ros.flight.campaign import flight_key
+from beetle_omni_ros.flight.evaluate import prepared
 from beetle_omni_ros.flight.loop import collector_off, FlightLoop
-from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.mode import DISARMED, FALLBACK, FLYING, MOTORS_OFF
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.sim.fault_lists import Case
-from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.faults import Case, Fault
 from beetle_omni_ros.sim.sensors import Impact, Truth
-from beetle_omni_ros.supervisor.events import INFO
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import INFO, SupervisorParameters
 
 STARTS = ('hover', 'moving', 'upside_down')      # default
 ALL_STARTS = (*STARTS, 'random')
@@ -54,7 +47,7 @@ BETTER = {'flies_on': ('flies_on', 'refused'), 'lands': ('flies_on', 'refused', 
 
 
 @dataclass(frozen=True)
-class Plan:
+class FaultPlan:
     """Flights of the campaign, and limits of their outcomes."""
 
     height: float = 1.5             # [m] of hover and inverted hover
@@ -79,11 +72,11 @@ class Plan:
     landing_inclination: float = 0.3490659  # [rad] 20 deg, in the landing campaign
 
 
-PLAN = Plan()
+PLAN = FaultPlan()
 
 
 @dataclass(frozen=True)
-class Trial:
+class FaultFlight:
     """Parameters of a flight."""
 
     case: str                   # name of the fault in the list, or of a landing or healthy flight
@@ -105,74 +98,94 @@ class Trial:
     @property
     def key(self) -> str:
         """Digest of everything that determines its result."""
-        return flight_key(fly_trial, self.controller, self.case, self.start, str(self.seed),
+        return flight_key(fly_case, self.controller, self.case, self.start, str(self.seed),
                           self.conditions, self.listed, plant=self.plant)
 
 
-def fly_trial(trial: Trial, case: Case, bags: Path | None = None, plan: Plan = PLAN) -> dict:
+def fly_case(flight: FaultFlight, case: Case, bags: Path | None = None,
+             plan: FaultPlan = PLAN) -> dict:
     """
-    Fly one trial of a case; ``bags`` is the folder for its bag.
+    Fly one flight of a case; ``bags`` is the folder for its bag.
 
     Returns:
-        the trial's fields, flown_s, state, good, bag (its name or ''), error ('' without an
+        the flight's fields, flown_s, state, good, bag (its name or ''), error ('' without an
         exception), and the fields of :meth:`Watcher.observed` or, of a healthy flight, alarms
         (stamp, severity and text of every event above information and of every named fault).
 
     """
-    result = {**asdict(trial), 'good': False, 'bag': trial.name if bags else '', 'error': '',
+    result = {**asdict(flight), 'good': False, 'bag': flight.name if bags else '', 'error': '',
               'flown_s': 0.0}
     try:
-        with collector_off(), ExitStack() as stack:
-            recorder = stack.enter_context(BagWriter(
-                bags / trial.name, asdict(trial))) if bags else Recorder()
-            result.update(_fly_healthy(trial, recorder, plan) if case == HEALTHY
-                          else _fly_fault(trial, case, recorder, plan))
+        with collector_off(), closing(_loop(flight, case, bags)) as loop:
+            loop.take_off()
+            # With other moves for each fault, a seed is not one move.
+            moves = np.random.default_rng(
+                [flight.seed, crc32(flight.case.encode())] if flight.start else flight.seed)
+            result.update(_fly_healthy(loop, moves, plan) if case == HEALTHY
+                          else _fly_struck(loop, moves, flight, case, plan))
     except Exception as error:          # the campaign continues and reports the error
         text = f'{type(error).__name__}: {error}'[:200]
         result.update(outcome='error', error=text, failure=text)
     return result
 
 
-def _fly_fault(trial, case, recorder, plan):
+def _loop(flight, case, bags):
+    """Return the robot and its flight stack on the ground."""
+    nominal = RobotParameters.load()
+    true = RobotParameters.load(flight.plant) if flight.plant else nominal
+    conditions = flight.conditions
+    if conditions == 'effects':
+        true, conditions = replace(true, effects=true.effects | EFFECTS), 'nominal'
+    return prepared(flight.controller, robot=nominal, plant=true, conditions=conditions,
+                    seed=flight.seed, pilot=True, faults=case.strike, meta=asdict(flight),
+                    bag=bags / flight.name if bags else None)
+
+
+def _fly_struck(loop, moves, flight, case, plan):
     """Fly to the start, start the fault, fly on with it unless it is a landing, and land."""
-    flight = Flight(trial, case, plan, recorder)
-    left, moving = plan.watch_time, trial.start in ('moving', 'random')
-    part = flight.random.uniform()
+    simulator = loop.simulator
+    left, moving = plan.watch_time, flight.start in ('moving', 'random')
+    part = moves.uniform()
     if moving:
-        pose_time, later = (plan.pose_time, plan.pose_time) if trial.start == 'random' \
+        pose_time, later = (plan.pose_time, plan.pose_time) if flight.start == 'random' \
             else (plan.move_time, plan.jitter)
-        flight.aim_randomly()
-        flight.fly(pose_time)
-        flight.aim_randomly()
-        flight.fly(part * later)
-    elif trial.start:
-        upside_down = trial.start == 'upside_down'
-        flight.aim((0.0, 0.0, plan.height), (np.pi if upside_down else 0.0, 0, 0))
-        flight.fly((plan.turn_time if upside_down else plan.hover_time) + plan.jitter * part)
+        _aim(loop, *random_poses(1, moves))
+        loop.run(pose_time)
+        _aim(loop, *random_poses(1, moves))
+        loop.run(part * later)
+    elif flight.start:
+        upside_down = flight.start == 'upside_down'
+        _aim(loop, [0, 0, plan.height, 180.0 * upside_down, 0, 0])
+        loop.run((plan.turn_time if upside_down else plan.hover_time) + plan.jitter * part)
     else:
-        flight.aim((0.0, 0.0, plan.height), attitude(trial.seed))
-        flight.fly(plan.turn_time)
+        _aim(loop, [0, 0, plan.height, *np.degrees(attitude(flight.seed))])
+        loop.run(plan.turn_time)
         left = 0.0
-    watcher = Watcher(flight)
-    start = flight.simulator.time
-    flight.loop.start_faults()
+    watcher = Watcher(loop, plan)
+    start = simulator.time
+    loop.start_faults()
     over = False
     while left > 0 and not over:
         period = min(left, plan.move_time) if moving else left
-        over = flight.fly(period, watcher)
+        over = loop.run(period, watcher)
         left -= period
         if left > 0 and not over:
-            flight.aim_randomly()
-    asked = flight.supervisor.state in AIRBORNE
+            _aim(loop, *random_poses(1, moves))
+    asked = loop.supervisor.state in AIRBORNE
     if not over:
-        flight.land(watcher)
+        loop.request('land')
+        loop.run(plan.landing_time, watcher)
     seen = watcher.observed(asked=asked)
     good = seen['outcome'] in BETTER[case.expected]
-    if good and not trial.start:
+    if good and not flight.start:
         good = bool(seen['impact_m_s'] <= plan.landing_speed
                     and np.radians(seen['inclination_deg']) <= plan.landing_inclination)
-    return {**seen, 'expected': case.expected, 'flown_s': flight.simulator.time - start,
-            'good': good}
+    return {**seen, 'expected': case.expected, 'flown_s': simulator.time - start, 'good': good}
+
+
+def _aim(loop, pose):
+    """Set a target: x, y, z in world [m], roll, pitch, yaw [deg]."""
+    loop.aim(pose_target(np.array(pose, dtype=float), loop.now()))
 
 
 def attitude(seed: int) -> np.ndarray:
@@ -183,82 +196,36 @@ def attitude(seed: int) -> np.ndarray:
     return rpy
 
 
-def _fly_healthy(trial, recorder, plan):
+def _fly_healthy(loop, moves, plan):
     """Fly random poses and land."""
-    flight = Flight(trial, HEALTHY, plan, recorder)
-    simulator, supervisor = flight.simulator, flight.supervisor
+    simulator, supervisor = loop.simulator, loop.supervisor
     start = simulator.time
     while simulator.time - start < plan.healthy_time and supervisor.state in AIRBORNE:
         if simulator.battery.charge < FRESH:
             simulator.battery.reset()
-        flight.aim_randomly()
-        flight.fly(plan.pose_time)
-    flight.land(lambda: supervisor.state == DISARMED)
-    epoch = flight.loop.epoch
-    alarms = [[event.stamp - epoch, event.severity, event.text] for event in flight.loop.events
+        _aim(loop, *random_poses(1, moves))
+        loop.run(plan.pose_time)
+    loop.request('land')
+    loop.run(plan.landing_time, lambda: supervisor.state == DISARMED)
+    alarms = [[event.stamp - loop.epoch, event.severity, event.text] for event in loop.events
               if event.severity != INFO]
-    alarms += [[stamp - epoch, 'fault', name] for name, stamp in supervisor.faults.items()]
+    alarms += [[stamp - loop.epoch, 'fault', name] for name, stamp in supervisor.faults.items()]
     landed = supervisor.state == DISARMED
     return {'flown_s': simulator.time - start, 'state': supervisor.state, 'alarms': alarms,
             'outcome': 'flies_on' if landed else 'does not land', 'good': landed and not alarms}
 
 
-class Flight:
-    """One robot with its flight stack, in the air; ``loop.start_faults`` starts its faults."""
-
-    def __init__(self, trial: Trial, case: Case, plan: Plan, recorder: Recorder):
-        nominal = RobotParameters.load()
-        aboard = {entry.name: entry.make(nominal) for entry in map(
-            registry.find, dict.fromkeys([trial.controller, registry.pilot()]))}
-        true = RobotParameters.load(trial.plant) if trial.plant else nominal
-        conditions = trial.conditions
-        if conditions == 'effects':
-            true, conditions = replace(true, effects=true.effects | EFFECTS), 'nominal'
-        self.plan = plan
-        self.loop = FlightLoop(nominal, true, aboard, recorder, conditions=conditions,
-                               seed=trial.seed, faults=case.strike, epoch=int(time()))
-        self.simulator, self.supervisor = self.loop.simulator, self.loop.supervisor
-        # With other moves for each fault, a seed is not one move.
-        self.random = np.random.default_rng(
-            [trial.seed, crc32(trial.case.encode())] if trial.start else trial.seed)
-        self.loop.take_off()
-
-    def aim(self, position, rpy) -> None:
-        """Set the target pose: (3,) in world [m], roll, pitch and yaw [rad]."""
-        self.loop.aim(PoseTarget(np.array(position, dtype=float), rotations.from_rpy(*rpy),
-                                 self.loop.now()))
-
-    def aim_randomly(self) -> None:
-        """Set a random target pose, as of random100."""
-        pose = random_poses(1, self.random)[0]
-        self.aim(pose[:3], np.radians(pose[3:]))
-
-    def fly(self, duration: float, over: Callable[[], bool] = lambda: False) -> bool:
-        """Fly for ``duration`` [s] or until ``over`` is true; returns whether it became true."""
-        end = self.simulator.time + duration
-        while self.simulator.time < end:
-            self.loop.step()
-            if over():
-                return True
-        return False
-
-    def land(self, over: Callable[[], bool]) -> None:
-        """Request a landing and fly on."""
-        self.loop.request('land')
-        self.fly(self.plan.landing_time, over)
-
-
 class Watcher:
     """Follows a flight from the onset of its fault; a call returns whether the flight is over."""
 
-    def __init__(self, flight: Flight):
+    def __init__(self, loop: FlightLoop, plan: FaultPlan):
         """Start now."""
         own = SupervisorParameters.load()
-        self._flight, self._plan = flight, flight.plan
+        self._loop, self._plan = loop, plan
         self._fence = np.array([own.fence_half_width, own.fence_half_width, own.fence_height])
-        self._place, self._start = flight.simulator.truth.position.copy(), flight.simulator.time
-        self._past_events = len(flight.loop.events)
-        self._past_faults = set(flight.supervisor.faults)
+        self._place, self._start = loop.simulator.truth.position.copy(), loop.simulator.time
+        self._past_events = len(loop.events)
+        self._past_faults = set(loop.supervisor.faults)
         self._still = self._down = 0.0
         self._floor: float | None = None
         self.impacts: list[Impact] = []             # touchdowns
@@ -271,10 +238,10 @@ class Watcher:
 
     def __call__(self) -> bool:
         """Observe the last tick; returns whether the flight is over."""
-        simulator, supervisor = self._flight.simulator, self._flight.supervisor
+        simulator, supervisor = self._loop.simulator, self._loop.supervisor
         truth, tick = simulator.truth, simulator.tick
         self.step(truth, float(simulator.link.thrust.sum()), tick)
-        self.said = self.said or next((event.text for event in self._flight.loop.events[
+        self.said = self.said or next((event.text for event in self._loop.events[
             self._past_events:] if event.severity != INFO), '')
         if not self.named[0]:
             self.named = next(((name, simulator.time - self._start) for name in supervisor.faults
@@ -311,11 +278,11 @@ class Watcher:
             'inclination_deg': None if inclined is None else float(np.degrees(inclined)),
             'overrun_s': self.overrun, 'flyaway': self.flyaway, 'takeoffs': self.takeoffs,
             'named': self.named[0], 'named_s': self.named[1], 'said': self.said,
-            'state': self._flight.supervisor.state}
+            'state': self._loop.supervisor.state}
 
     def outcome(self, asked: bool) -> str:
         """Outcome of the flight as one word of :data:`.page.OUTCOMES`."""
-        stopped = self._flight.supervisor.state in MOTORS_OFF
+        stopped = self._loop.supervisor.state in MOTORS_OFF
         if self.flyaway:
             return 'flyaway'
         if self.takeoffs:
@@ -331,4 +298,4 @@ class Watcher:
             return 'tilted'
         if not asked:
             return 'lands'
-        return 'refused' if self._flight.loop.refusals else 'flies_on'
+        return 'refused' if self._loop.refusals else 'flies_on'

@@ -1,35 +1,178 @@
 """`beetle_omni faults`: flies listed faults, landings or healthy flights; writes one page."""
 
+from collections import Counter
 from datetime import datetime, timezone
 from math import ceil
 from pathlib import Path
 import shlex
 import sys
 
+import numpy as np
 from rich.console import Console
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
-from beetle_omni_ros.flight import fault_page as page
 from beetle_omni_ros.flight.campaign import file_digest, Store, sweep
 from beetle_omni_ros.flight.fault_flights import (
     ALL_STARTS,
     CONDITIONS,
-    fly_trial,
+    FaultFlight,
+    fly_case,
     HEALTHY,
     LANDING,
     LANDING_BLIND,
     PLAN,
     STARTS,
-    Trial,
 )
 from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import commit
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.show.page import print_grids
-from beetle_omni_ros.sim.fault_lists import chosen, load_cases
+from beetle_omni_ros.show.page import (
+    ABSENT,
+    Grid,
+    html,
+    markdown,
+    number,
+    page,
+    print_grids,
+    section,
+    verdict_head,
+)
+from beetle_omni_ros.sim.faults import Case, chosen, load_cases
+
+# --- page ----------------------------------------------------------------------------------------
+
+NOTE = ('good: flights with the expected outcome or a better one. impact: speed of base_link at '
+        'the fastest touchdown of a flight. named: median time until the supervisor detected a '
+        'fault.')
+FAULT, PARTLY, SUCCESS = '#b3261e', '#d98a1c', '#2f8f5b'
+SOFTLY = f'{PLAN.impact_speed:g} m/s and {np.degrees(PLAN.inclination):.0f} deg'
+# Outcome -> meaning, the best outcome first.
+OUTCOMES = {
+    'flies_on': f'still flying when the landing was requested; it ended below {SOFTLY}',
+    'refused': 'the same, and the request was refused',
+    'lands': f'landed by itself, below {SOFTLY}',
+    'stops': f'broke at the floor; the motors were off within {PLAN.stop_time:g} s and stayed off',
+    'hard': f'touched down intact, above {PLAN.impact_speed:g} m/s',
+    'tilted': f'touched down softly but beyond {np.degrees(PLAN.inclination):.0f} deg',
+    'does not land': 'motors on long after the landing was requested',
+    'crash, motors on': f'broke, and thrust was commanded for more than {PLAN.stop_time:g} s',
+    'takes off': f'rose by {PLAN.rise:g} m after lying on the floor for {PLAN.rest_time:g} s',
+    'flyaway': f'{PLAN.fence_margin:g} m outside the fence, or {PLAN.distance:g} m away',
+    'error': 'a part of the flight stack raised an exception'}
+
+
+def summary(flights: list[dict], cases: dict[str, Case]) -> dict:
+    """
+    Summarise flights.
+
+    Returns:
+        ``faults``: name of the fault, or landing or healthy flight with its conditions -> numbers
+        of its flights; ``total``: the sums.
+
+    """
+    groups: dict[str, list[dict]] = {}
+    for one in flights:
+        name = one['case'] if one['start'] else f"{one['case']}, {one['conditions']}"
+        groups.setdefault(name, []).append(one)
+    return {'faults': {name: _row(flown, cases) for name, flown in groups.items()}, 'total': {
+        'flights': len(flights), 'good': sum(one['good'] for one in flights),
+        'flyaways': sum(one.get('flyaway', False) for one in flights),
+        'motors_on_after_crash': sum(
+            one.get('overrun_s', 0.0) > PLAN.stop_time for one in flights),
+        'takeoffs': sum(one.get('takeoffs', 0) > 0 for one in flights),
+        'errors': sum(bool(one['error']) for one in flights)}}
+
+
+def _row(flown, cases):
+    def known(key):
+        return [one[key] for one in flown if one.get(key) is not None]
+
+    def median(key):
+        return float(np.median(known(key))) if known(key) else None
+
+    case = cases[flown[0]['case']]
+    alarms = Counter(text for one in flown for *_, text in one.get('alarms', ()))
+    return {
+        'what': case.what, 'expected': case.expected,
+        'flights': len(flown), 'good': sum(one['good'] for one in flown),
+        'outcomes': dict(Counter(one['outcome'] for one in flown).most_common()),
+        'impact_median_m_s': median('impact_m_s'),
+        'impact_worst_m_s': max(known('impact_m_s'), default=None),
+        'inclination_worst_deg': None if flown[0]['start'] else max(known('inclination_deg'),
+                                                                    default=None),
+        'named': dict(Counter(filter(None, known('named'))).most_common()),
+        'named_s': median('named_s'),
+        'hours': sum(known('flown_s')) / 3600, 'alarms': dict(alarms.most_common())}
+
+
+def grid(results: dict, narrow: bool = False) -> Grid:
+    """Table of the summary; ``narrow``: for 80 columns. Columns without content are left out."""
+    rows = results['summary']['faults']
+    cells = [[
+        name, row['expected'], f"{row['good']}/{row['flights']}",
+        _counted(row['outcomes'], '\n' if narrow else ', '), number(row['impact_worst_m_s']),
+        number(row['inclination_worst_deg']), number(row['named_s']), _counted(row['alarms']),
+        *([] if narrow else [number(row['impact_median_m_s']), row['what']])]
+        for name, row in rows.items()]
+    header = ['fault', 'expected', 'good', 'outcomes', 'impact worst [m/s]',
+              'inclination worst [deg]', 'named [s]', 'alarms', 'impact median [m/s]',
+              'what happens']
+    shown = [k for k in range(len(cells[0])) if any(row[k] not in ('', ABSENT) for row in cells)]
+    return Grid('', [header[k] for k in shown], [[row[k] for k in shown] for row in cells],
+                note=NOTE)
+
+
+def total_text(results: dict) -> str:
+    """Summary of the campaign in one sentence."""
+    total = results['summary']['total']
+    return (f"{total['good']} of {total['flights']} flights ended as expected; "
+            f"{total['flyaways']} flyaways, {total['motors_on_after_crash']} with motors on after "
+            f"a crash, {total['takeoffs']} take-offs without arming, {total['errors']} errors.")
+
+
+def as_markdown(results: dict) -> str:
+    """All results as Markdown."""
+    return (f"# Faults\n\n{results['meta']['command']}\n\n{total_text(results)}\n\n"
+            + markdown(grid(results)))
+
+
+def as_page(results: dict, folder: Path | None = None) -> str:
+    """All results as one HTML page; ``folder`` is its folder, which contains recorded bags."""
+    meta, total, flights = results['meta'], results['summary']['total'], results['flights']
+    severe = any(total[key] for key in ('flyaways', 'motors_on_after_crash', 'takeoffs', 'errors'))
+    colour = FAULT if severe else SUCCESS if total['good'] == total['flights'] else PARTLY
+    made = [meta['command'], meta['date'], f"version {meta['version']}"
+            + (f", commit {meta['commit']}" if meta['commit'] else '')]
+    bags = f'Page of one flight: beetle_omni report {folder}/bags/BAG --output flight.html' \
+        if any(one['bag'] for one in flights) else ''
+    bad = [one for one in flights if not one['good']]
+    return page(
+        'Faults', ' · '.join(made), [grid(results)],
+        [f'{name}: {text}' for name, text in OUTCOMES.items()],
+        [*([section('Flights that did not end as expected', '', html(_flights(bad)))]
+           if bad else []), section('Each flight', bags, html(_flights(flights)))],
+        verdict_head(f"{total['good']} of {total['flights']} as expected", colour,
+                     total_text(results)))
+
+
+def _flights(flights):
+    """Table with one row for each flight."""
+    return Grid('', ['fault', 'from', 'seed', 'conditions', 'expected', 'outcome', 'impact [m/s]',
+                     'first message', 'bag'], [
+        [*(str(one.get(key, ABSENT)) for key in (
+            'case', 'start', 'seed', 'conditions', 'expected', 'outcome')),
+         number(one.get('impact_m_s')), one.get('said') or one['error'] or ABSENT,
+         one['bag'] or ABSENT] for one in flights])
+
+
+def _counted(counts, between=', '):
+    return between.join(f'{count} {text}' for text, count in counts.items())
+
+
+# --- command -------------------------------------------------------------------------------------
 
 PAGE, FLIGHTS = 'faults.html', '.flights'
 
@@ -66,24 +209,25 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     elif healthy:
         struck, begins, under = [HEALTHY], ('',), CONDITIONS
         count = ceil(3600 * healthy / PLAN.healthy_time)
-    calls = [(Trial(case.name, start, k, name, **common), case, output / 'bags' if bags else None)
+    folder = output / 'bags' if bags else None
+    calls = [(FaultFlight(case.name, start, k, name, **common), case, folder)
              for case in struck for start in begins for name in under
              for k in range(seed, seed + count)]
     store = Store(output / FLIGHTS) if output else None
-    flown = sweep(fly_trial, calls, store=None if bags else store, jobs=jobs,
+    flown = sweep(fly_case, calls, store=None if bags else store, jobs=jobs,
                   console=console)      # a stored flight records no bag
     results = {'meta': {
         'command': shlex.join(['beetle_omni', *sys.argv[1:]]), 'version': __version__,
         'commit': commit(), 'date': datetime.now(timezone.utc).strftime('%Y-%m-%d'),
         'guidance': guidance, 'plant': str(plant) if plant else None},
-        'flights': flown, 'summary': page.summary(flown, {case.name: case for case in struck})}
+        'flights': flown, 'summary': summary(flown, {case.name: case for case in struck})}
     write_json(json_path, results)
     if output:
         write_json(output / 'faults.json', results)
-        write_text(output / PAGE, page.as_page(results, output), 'page')
-        write_text(output / 'faults.md', page.as_markdown(results), 'page')
-    print_grids([page.grid(results, narrow=True)], console)
-    for text in (page.total_text(results), f'page: {output / PAGE}' if output
+        write_text(output / PAGE, as_page(results, output), 'page')
+        write_text(output / 'faults.md', as_markdown(results), 'page')
+    print_grids([grid(results, narrow=True)], console)
+    for text in (total_text(results), f'page: {output / PAGE}' if output
                  else 'no page written; --output DIR writes one'):
         console.print(text, highlight=False, markup=False, soft_wrap=True)
     return results

@@ -22,20 +22,21 @@ from beetle_omni_ros.control.base import Controller, PoseTarget, Target
 from beetle_omni_ros.control.tasks import Task
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight.component import Component, DIAGNOSTICS_PERIOD, Timer
-from beetle_omni_ros.flight.controller import CANNOT_BE_FLOWN, ControllerComponent
-from beetle_omni_ros.flight.estimator import Estimator
 from beetle_omni_ros.flight.process_faults import ProcessFaults
-from beetle_omni_ros.flight.reference import DONE, Reference, WAITING
-from beetle_omni_ros.flight.simulated import SimulatedRobot
-from beetle_omni_ros.flight.supervision import SupervisorComponent
+from beetle_omni_ros.flight.stack import (
+    CANNOT_BE_FLOWN,
+    ControllerComponent,
+    Estimator,
+    SupervisorComponent,
+)
+from beetle_omni_ros.flight.surroundings import DONE, SimulatedRobot, TaskReference, WAITING
 from beetle_omni_ros.model.mode import FLYING, IN_FLIGHT, MOTORS_OFF, TAKEOFF
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
-from beetle_omni_ros.supervisor.events import Event
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import Event, SupervisorParameters
 
 START_TIMEOUT = 5.0      # [s] for the estimator; noisy poses can need longer than ARMING_TIME
 TAKEOFF_TIMEOUT = 30.0   # [s] simulated time for the take-off
@@ -68,8 +69,7 @@ class Loop:
     """
     Host of components and a simulated robot, advanced tick by tick.
 
-    ``through`` gets (topic, value) of each published message and returns the values that arrive.
-    A recorder gets all of them. ``epoch`` is the time of the stamps at the start [s].
+    A recorder gets all messages. ``epoch`` is the time of the stamps at the start [s].
 
     Attributes:
         robot: the simulated robot.
@@ -80,13 +80,12 @@ class Loop:
     simulated = True
 
     def __init__(self, robot: SimulatedRobot, components: Sequence[Component],
-                 recorder: Recorder | None = None,
-                 through: Callable[[str, Any], list] | None = None, epoch: int = EPOCH):
+                 recorder: Recorder | None = None, epoch: int = EPOCH):
         self.robot, self.refusals = robot, []       # type: ignore[var-annotated]
         robot.simulator.epoch = epoch
         self._elapsed = robot.simulator.time
         self._now = epoch + self._elapsed
-        self._recorder, self._through = recorder or Recorder(), through
+        self._recorder = recorder or Recorder()
         self._queue: deque[tuple[str, Any, str]] = deque()
         self._readers: dict[str, list[Component]] = defaultdict(list)
         self._timers: list[tuple[Component, Timer]] = []
@@ -132,14 +131,6 @@ class Loop:
 
     def publish(self, topic: str, value: Any, source: str = '') -> None:
         """Queue a message."""
-        if self._through is None:
-            self._queue.append((topic, value, source))
-            return
-        for one in self._through(topic, value):
-            self.deliver_later(topic, one, source)
-
-    def deliver_later(self, topic: str, value: Any, source: str = '') -> None:
-        """Queue a message that has passed all faults."""
         self._queue.append((topic, value, source))
 
     def log(self, severity: str, text: str) -> None:
@@ -182,11 +173,13 @@ class Loop:
         while queue:
             topic, value, source = queue.popleft()
             write(topic, value, self._now)
+            published = None
             if topic in LATCHED_TOPICS:
                 self._latched[topic] = value
-            published = math.nan if topic in TARGETS else None
-            for component in self._readers.get(topic, ()):
-                if component in waiting:
+                if topic in TARGETS:
+                    published = math.nan
+            for component in self._readers[topic]:
+                if waiting and component in waiting:
                     waiting[component][topic].append((value, source, published))
                 else:
                     component.feed(topic, value, source, published)
@@ -246,7 +239,7 @@ class FlightLoop(Loop):
         super().__init__(
             SimulatedRobot(self.simulator, plant),
             [self._estimator, *self._controllers.values(), self._supervision, *others], recorder,
-            self._through_faults if faults else None, epoch)
+            epoch)
         self.deliver()
 
     def fly(self, task: Task, progress: Callable[..., None] | None = None) -> bool:
@@ -257,7 +250,7 @@ class FlightLoop(Loop):
         returns true. ParameterError and RunError: no take-off.
         """
         simulator = self.simulator
-        reference = Reference(task, partial(setattr, simulator, 'payload'))
+        reference = TaskReference(task, partial(setattr, simulator, 'payload'))
         with collector_off():
             self.add(reference)
             self.take_off()
@@ -270,7 +263,8 @@ class FlightLoop(Loop):
                     self.start_faults()
                 if reference.state != state:
                     state = reference.state
-                    if simulator.battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
+                    inputs = self.supervisor.inputs
+                    if inputs.battery_low or simulator.battery.charge < SWAP_CHARGE:
                         simulator.battery.reset()
                 if progress and simulator.time - reported >= DIAGNOSTICS_PERIOD:
                     reported += DIAGNOSTICS_PERIOD
@@ -314,8 +308,18 @@ class FlightLoop(Loop):
                 if not answer:
                     raise RunError(answer.text)
 
+    def run(self, duration: float, over: Callable[[], bool] = lambda: False) -> bool:
+        """Step for ``duration`` [s] or until ``over`` is true; return whether it became true."""
+        end = self.simulator.time + duration
+        while self.simulator.time < end:
+            self.step()
+            if over():
+                return True
+        return False
+
     def close(self) -> None:
-        """Release what the flight used."""
+        """End the recording."""
+        self._recorder.close()
 
     def request(self, name: str):
         """Call a service of the supervisor; returns its answer."""
@@ -343,8 +347,12 @@ class FlightLoop(Loop):
         self._faults.set([one for one in self._given_faults if one.is_process],
                          self.simulator.time)
 
-    def _through_faults(self, topic, value):
-        return self._faults.passed(topic, value, self.supervisor.active, self.now())
+    def publish(self, topic: str, value: Any, source: str = '') -> None:
+        """Queue a message, or what the faults of its process make of it."""
+        values = [value] if self._faults.empty else self._faults.passed(
+            topic, value, self.supervisor.active, self.now())
+        for one in values:
+            super().publish(topic, one, source)
 
     def before_messages(self) -> None:
         """Apply the faults of processes that begin, last or end in this tick."""
@@ -355,7 +363,7 @@ class FlightLoop(Loop):
         self.simulator.epoch = self.epoch + faults.clock_step
         self._now = self.simulator.epoch + self.simulator.time
         for topic, value in faults.messages(self.supervisor.active, self.now()):
-            self.deliver_later(topic, value)
+            super().publish(topic, value)
         if faults.supervisor_waits:
             self.suspend(self._supervision)
         else:

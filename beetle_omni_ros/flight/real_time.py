@@ -76,8 +76,9 @@ class EmulatedLoop(FlightLoop):
         super().take_off()
 
     def close(self) -> None:
-        """Switch the devices off."""
+        """Switch the devices off and end the recording."""
         for bridge in self._bridges:
             bridge.close()
         self.robot.close()
         sys.setswitchinterval(self._switch_interval)
+        super().close()

@@ -4,20 +4,91 @@ Numbers of a comparison: metrics of all flights of one task and conditions, by c
 The summary is part of the JSON file, and the page takes each of its numbers from it.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from math import isfinite, sqrt
 from pathlib import Path
 from typing import Any
 from zlib import crc32
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from beetle_omni_ros.bags.metrics import at, CRASHED, failed, POSE_KEYS
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import PUSH_PERIOD, RISING, TILTS
-from beetle_omni_ros.flight.compared_flights import Flight
-from beetle_omni_ros.flight.statistics import compared
 from beetle_omni_ros.show import table as published
+from beetle_omni_ros.show.figures import LINES
+
+# --- statistics ----------------------------------------------------------------------------------
+
+# Intervals are expanded percentile intervals (T. C. Hesterberg, What teachers should know about
+# the bootstrap, 2015): percentiles of resampled means, so far outside that ten flights have the
+# width of Student's t. Plain percentiles are too narrow by a fifth there.
+CONFIDENCE = 0.95
+RESAMPLES = 10_000
+SEED = 0
+FEWEST = 6      # values of an interval; fewer have equal signs by chance in over 5 % of the cases
+
+# Values of a controller by what was flown: (seed,) or (seed, pose).
+Sample = Mapping[tuple[int, ...], float | None]
+
+
+@cache
+def _drawn(count):
+    """(RESAMPLES, count) indices of the resampled values."""
+    return np.random.default_rng(SEED).integers(count, size=(RESAMPLES, count), dtype=np.int32)
+
+
+def described(values: np.ndarray) -> dict:
+    """Mean, its interval [low, high] (None with less than FEWEST values), min, max, count."""
+    count = len(values)
+    if not count:
+        return {'mean': None, 'low': None, 'high': None, 'min': None, 'max': None, 'count': 0}
+    low = high = None
+    if count >= FEWEST:
+        far = stdtrit(count - 1, 0.5 - 0.5 * CONFIDENCE)
+        tail = ndtr(far * sqrt(count / (count - 1)))
+        low, high = map(float, np.quantile(values[_drawn(count)].mean(axis=1), (tail, 1 - tail)))
+    return {'mean': float(values.mean()), 'low': low, 'high': high, 'min': float(values.min()),
+            'max': float(values.max()), 'count': count}
+
+
+def compared(samples: Mapping[str, Sample], more: bool = False) -> dict[str, dict]:
+    """
+    Describe each controller, and its difference to the one with the least mean.
+
+    Args:
+        samples: controller -> its values; None where it did not fly to the end.
+        more: whether more is better.
+
+    Returns:
+        Controller -> :func:`described`, with ``difference``, the same of its paired differences
+        to the best mean (None for that one), and ``best``: whether it has the best mean, and each
+        interval of a difference to it excludes zero.
+
+    """
+    known = {name: {key: value for key, value in sample.items()
+                    if value is not None and isfinite(value)} for name, sample in samples.items()}
+    made = {name: described(np.array(list(values.values()))) for name, values in known.items()}
+    sign, flown = -1.0 if more else 1.0, [name for name in made if made[name]['count']]
+    if not flown:
+        return {name: {**entry, 'difference': None, 'best': False} for name, entry in made.items()}
+    first = min(flown, key=lambda name: sign * made[name]['mean'])
+    for name, values in known.items():
+        shared = [values[key] - known[first][key] for key in values if key in known[first]]
+        made[name].update(best=False,
+                          difference=None if name == first else described(np.array(shared)))
+    worse = [made[name]['difference'] for name in flown if name != first]
+    made[first]['best'] = bool(worse) and all(
+        entry['low'] is not None and min(sign * entry['low'], sign * entry['high']) > 0
+        for entry in worse)
+    return made
+
+
+# --- metrics -------------------------------------------------------------------------------------
 
 PREFIX = 'published_'    # prefix of a controller in the publication
 # Colours of controllers outside the package, chosen by name.
@@ -57,11 +128,12 @@ def look(controller: str) -> Look:
     """Look of a controller, or of its published counterpart."""
     name = controller.removeprefix(PREFIX)
     entry = registry.SHIPPED.get(name)
+    line = LINES.get(name, (SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1))))
     if entry is None:
-        return Look(name, '', SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1)))
+        return Look(name, '', *line)
     if name != controller:
-        return Look(entry.label, 'the publication', entry.line[0], ':')
-    return Look(entry.label, entry.description, *entry.line)
+        return Look(entry.label, 'the publication', line[0], ':')
+    return Look(entry.label, entry.description, *line)
 
 
 def kind_of(task: str) -> str:
@@ -83,7 +155,7 @@ class Metric:
     Attributes:
         title: its name with the unit.
         digits: displayed digits.
-        of: function of the metrics of a flight: the number, or the list of those of its poses.
+        of: path in the metrics of a flight, or function of them.
         printed: path of the published mean.
         more: whether more is better.
         glance: whether it is in the table of all experiments.
@@ -92,63 +164,42 @@ class Metric:
 
     title: str
     digits: int
-    of: Callable[[dict], Any]
+    of: str | Callable[[dict], Any]
     printed: str = ''
     more: bool = False
     glance: bool = False
 
-
-def _at(title, digits, path, printed='', **options):
-    """Metric at a path of keys in the metrics of a flight."""
-    return Metric(title, digits, lambda judged: at(judged, path), printed, **options)
-
-
-def _poses():
-    names = ('U ‖p error‖ [m]', 'U ‖θ error‖ [deg]', 'L ‖p error‖ [m]', 'L ‖θ error‖ [deg]')
-    made = {key: Metric(name, digits, lambda judged, key=key: [
-        pose[key] for pose in judged['poses']], f'mean.{key}', glance=True)
-        for key, name, digits in zip(POSE_KEYS, names, (4, 2, 3, 2), strict=True)}
-    return {
-        **made,
-        'reached': Metric('poses reached [%]', 1, lambda judged: [
-            100.0 * pose['reached'] for pose in judged['poses']], more=True, glance=True),
-        'speed': _at('‖v‖ at the target [m/s]', 4, *2 * ['hover_speed_mean_m_s']),
-        'rate': _at('‖ω‖ at the target [rad/s]', 4, *2 * ['hover_angular_speed_mean_rad_s']),
-        'joint_error': _at('|q* − q| [rad]', 4, *2 * ['joint_error_mean_rad']),
-        'joint_error_hover': _at('|q* − q| at the target [rad]', 4, 'joint_error_hover_mean_rad'),
-        'thrust': _at('thrust f* [N]', 2, *2 * ['thrust_mean_N']), **_changes(False)}
+    def value(self, judged: dict) -> Any:
+        """Return the number of a flight, or the list of those of its poses."""
+        return at(judged, self.of) if isinstance(self.of, str) else self.of(judged)
 
 
-def _changes(glance):
-    """Changes of the commands in 10 ms at the target."""
-    return {f'change_{key}': _at(f'{name} command change in 10 ms, RMS [{unit}]', digits,
-                                 f'hover_command_change_rms.{key}', glance=glance)
-            for key, name, unit, digits in (('joint_rad', 'tilt', 'rad', 5),
-                                            ('thrust_N', 'thrust', 'N', 4))}
+def _of_poses(key, scale=None):
+    return lambda judged: [pose[key] if scale is None else scale * pose[key]
+                           for pose in judged['poses']]
 
 
-def _waypoints():
-    means = {key: _at(metric.title, metric.digits, *2 * [metric.printed],
-                      glance=key in POSE_KEYS[:2])
-             for key, metric in _poses().items() if key in POSE_KEYS}
-    return {**means, 'reached': Metric('poses reached [%]', 1, lambda judged: 100.0 * (
-        judged['success_rate'] or 0.0), more=True)}
+def _recovery(judged):
+    return float(np.mean([PUSH_PERIOD if push['recovery_s'] is None else push['recovery_s']
+                          for push in judged['pushes']['pushes']]))
+
+
+def _worst_height(judged):
+    heights = [entry['height_error_m'] for entry in judged['payload']]
+    return None if None in heights else max(map(abs, heights))
 
 
 def _errors(kind):
     """Mean and largest errors of a trajectory or a hover."""
-    made = {}
-    for name, unit, digits in (('position', 'm', 4), ('orientation', 'deg', 3)):
-        path = f'{name}_mean_{unit}'
-        made[name] = _at(f'{name} error [{unit}]', digits, f'{kind}.{path}', path, glance=True)
-        made[f'{name}_max'] = _at(f'largest {name} error [{unit}]', digits,
-                                  f'{kind}.{name}_max_{unit}')
-    return made
+    return {f'{name}{end}': Metric(
+        f'{text}{name} error [{unit}]', digits, f'{kind}.{name}_{part}_{unit}',
+        f'{name}_{part}_{unit}' if part == 'mean' else '', glance=part == 'mean')
+        for name, unit, digits in (('position', 'm', 4), ('orientation', 'deg', 3))
+        for end, part, text in (('', 'mean', ''), ('_max', 'max', 'largest '))}
 
 
 def _disturbance(kind, _, levels, *times):
-    unit = 'N' if kind == 'force' else 'N_m'
-    beyond = 2.0 * levels[-1] - levels[-2]
+    unit, beyond = 'N' if kind == 'force' else 'N_m', 2.0 * levels[-1] - levels[-2]
 
     def lost(judged):
         level = judged[kind][f'lost_at_{unit}']
@@ -158,49 +209,55 @@ def _disturbance(kind, _, levels, *times):
                            f'{kind}_{unit}', more=True, glance=True)}
 
 
-def _wind():
-    made = {}
-    for name, unit, digits in (('position', 'm', 4), ('orientation', 'deg', 2)):
-        for part, text in (('mean', 'error'), ('std', 'standard deviation')):
-            path = f'{name}_{part}_{unit}'
-            made[path] = _at(f'strongest wind: {name} {text} [{unit}]', digits, f'wind.-1.{path}',
-                             path, glance=True)
-    return made
-
-
-def _pushes():
-    def recovery(judged):
-        return float(np.mean([PUSH_PERIOD if push['recovery_s'] is None else push['recovery_s']
-                              for push in judged['pushes']['pushes']]))
-
-    speed, rate = 'speed_mean_m_s', 'angular_speed_mean_rad_s'
-    return {'recovery': Metric('recovery to 0.02 m and 2 deg [s]', 2, recovery, glance=True),
-            'speed': _at('mean speed [m/s]', 3, f'pushes.{speed}', speed),
-            'rate': _at('mean body rate [rad/s]', 3, f'pushes.{rate}', rate)}
-
-
-def _payload():
-    def worst(judged):
-        found = [entry['height_error_m'] for entry in judged['payload']]
-        return None if None in found else max(map(abs, found))
-
-    return {'worst': Metric('largest height error [m]', 4, worst, glance=True)}
-
-
+_CHANGES = {     # of the commands in 10 ms at the target
+    f'change_{key}': Metric(f'{name} command change in 10 ms, RMS [{unit}]', digits,
+                            f'hover_command_change_rms.{key}')
+    for key, name, unit, digits in (('joint_rad', 'tilt', 'rad', 5),
+                                    ('thrust_N', 'thrust', 'N', 4))}
+_POSES = {
+    **{key: Metric(title, digits, _of_poses(key), f'mean.{key}', glance=True)
+       for key, title, digits in zip(POSE_KEYS, (
+           'U ‖p error‖ [m]', 'U ‖θ error‖ [deg]', 'L ‖p error‖ [m]', 'L ‖θ error‖ [deg]'),
+           (4, 2, 3, 2), strict=True)},
+    'reached': Metric('poses reached [%]', 1, _of_poses('reached', 100.0), more=True, glance=True),
+    **{key: Metric(title, digits, path, path) for key, title, digits, path in (
+        ('speed', '‖v‖ at the target [m/s]', 4, 'hover_speed_mean_m_s'),
+        ('rate', '‖ω‖ at the target [rad/s]', 4, 'hover_angular_speed_mean_rad_s'),
+        ('joint_error', '|q* − q| [rad]', 4, 'joint_error_mean_rad'))},
+    'joint_error_hover': Metric('|q* − q| at the target [rad]', 4, 'joint_error_hover_mean_rad'),
+    'thrust': Metric('thrust f* [N]', 2, *2 * ['thrust_mean_N']), **_CHANGES}
+# Kind of a task -> key -> metric.
 METRICS: dict[str, dict[str, Metric]] = {
-    'random': _poses(), 'poses': _poses(), 'waypoints': _waypoints(),
-    **{name: _errors('trajectory') for name in TILTS}, 'wind': _wind(), 'pushes': _pushes(),
-    **{name: _disturbance(*of) for name, of in RISING.items()}, 'payload': _payload(),
-    'hover': {**_errors('hover'), **_changes(True)}}
+    'random': _POSES, 'poses': _POSES,
+    'waypoints': {
+        **{key: replace(_POSES[key], of=f'mean.{key}', glance=key in POSE_KEYS[:2])
+           for key in POSE_KEYS},
+        'reached': Metric('poses reached [%]', 1, lambda judged: 100.0 * (
+            judged['success_rate'] or 0.0), more=True)},
+    **{name: _errors('trajectory') for name in TILTS},
+    'wind': {path: Metric(f'strongest wind: {name} {text} [{unit}]', digits, f'wind.-1.{path}',
+                          path, glance=True)
+             for name, unit, digits in (('position', 'm', 4), ('orientation', 'deg', 2))
+             for part, text in (('mean', 'error'), ('std', 'standard deviation'))
+             for path in (f'{name}_{part}_{unit}',)},
+    'pushes': {
+        'recovery': Metric('recovery to 0.02 m and 2 deg [s]', 2, _recovery, glance=True),
+        'speed': Metric('mean speed [m/s]', 3, 'pushes.speed_mean_m_s', 'speed_mean_m_s'),
+        'rate': Metric('mean body rate [rad/s]', 3, 'pushes.angular_speed_mean_rad_s',
+                       'angular_speed_mean_rad_s')},
+    **{name: _disturbance(*of) for name, of in RISING.items()},
+    'payload': {'worst': Metric('largest height error [m]', 4, _worst_height, glance=True)},
+    'hover': {**_errors('hover'), **{key: replace(metric, glance=True)
+                                     for key, metric in _CHANGES.items()}}}
 
 
-def summarise(flown: dict[Flight, dict]) -> dict:
+def summarise(flown: dict[Any, dict]) -> dict:
     """
     Summarise results of :func:`fly_flight`.
 
     Returns:
         ``tasks``: task -> conditions -> ``flights`` (controller -> seeds, failures, lost) and
-        ``metrics`` (name in :data:`METRICS` -> :func:`statistics.compared`); ``compute_ms``:
+        ``metrics`` (name in :data:`METRICS` -> :func:`compared`); ``compute_ms``:
         controller -> CPU time of a step, median of the flights' medians.
 
     """
@@ -235,7 +292,7 @@ def _sample(metric, by_seed):
     """Values of a controller by (seed,), or by (seed, pose)."""
     sample = {}
     for seed, judged in by_seed.items():
-        value = metric.of(judged)
+        value = metric.value(judged)
         sample |= {(seed, k): each for k, each in enumerate(value)} \
             if isinstance(value, list) else {(seed,): value}
     return sample
@@ -244,7 +301,7 @@ def _sample(metric, by_seed):
 def printed(task: str, metric: Metric, column: str) -> dict:
     """Published mean of a metric, with std, min and max where they are printed; {} for none."""
     numbers, real = PRINTED.get(kind_of(task), ({}, False))
-    found = numbers.get(PUBLISHED[column] + ', real robot' * real, {})
+    published_numbers = numbers.get(PUBLISHED[column] + ', real robot' * real, {})
     parts = ('mean', 'std', 'min', 'max') if 'mean' in metric.printed else ('mean',)
     return {part: value for part in parts
-            if (value := at(found, metric.printed.replace('mean', part))) is not None}
+            if (value := at(published_numbers, metric.printed.replace('mean', part))) is not None}

@@ -14,148 +14,85 @@ from beetle_omni_ros.identify.measured import (
 )
 from beetle_omni_ros.identify.robot_file import check_differs
 from beetle_omni_ros.identify.rotor import results as of_rotor
-from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
-from beetle_omni_ros.identify.servo import page as of_joints
-from beetle_omni_ros.identify.servo.joint import identify, joint_results
+from beetle_omni_ros.identify.rotor.log import chosen
+from beetle_omni_ros.identify.servo import results as of_joints
 from beetle_omni_ros.identify.servo.log import read_joint_log
 from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.show.page import page, print_grids, Terminal
 
+TITLES = {'joint': 'Tilt servos', 'rotor': 'Rotor', 'robot': 'Robot'}
 
-def run_identify_joint(paths: Sequence[Path], *, validate: Sequence[Path] = (),
-                       robot: Path | None = None, json_path: Path | None = None,
-                       report: Path | None = None, params: Path | None = None,
-                       console: Console | None = None) -> dict:
+
+def run_identify(what: str, paths: Sequence[Path], *, validate: Sequence[Path] = (),
+                 columns: Sequence[str] = (), rate: float | None = None,
+                 robot: Path | None = None, json_path: Path | None = None,
+                 report: Path | None = None, params: Path | None = None,
+                 console: Console | None = None) -> dict:
     """
-    Identify the tilt servos from response logs.
+    Identify tilt servos or a rotor from their logs, or write a robot file from both.
 
-    Arguments are those of `beetle_omni identify joint`.
+    ``what`` is `joint`, `rotor` or `robot`; the other arguments are those of this subcommand of
+    `beetle_omni identify`.
 
     Returns:
-        ``joints`` and ``meta``.
+        Results of the servos (``meta``, ``joints``, ``text``), those of the rotor (``verdict``,
+        ``surface``, ``plateaus``, ``lag``, ...), or both as ``servos`` and ``rotor`` with
+        ``robot``, the content of the file, and ``warnings``.
 
     Raises:
         LogError, ParameterError: unusable input.
 
     """
-    console = console or Terminal()
+    console, whole = console or Terminal(), what == 'robot'
     check_differs(params, robot)
-    robot_parameters = RobotParameters.load(robot)
-    logs = [read_joint_log(path) for path in paths]
-    validations = [read_joint_log(other) for other in validate]
-    with console.status(f'identifying {len(logs[0].joints)} joints'):
-        found = identify(logs, robot_parameters)
-    results = joint_results(found, validations, robot_parameters)
-    if robot:
-        results['meta']['robot'] = str(robot)
-    _print(console, of_joints.grids(results), results['text'])
-    write_json(json_path, results)
-    if report:
-        write_text(report, of_joints.joint_page(found, validations, robot_parameters, results),
-                   'report')
-    if params:
-        write_measured(params, robot_parameters, robot, _line('joint', paths, robot, params),
-                       paths, servo_values(found, robot_parameters), None)
-    return results
-
-
-def run_identify_rotor(paths: Sequence[Path], *, columns: Sequence[str] = (),
-                       rate: float | None = None, robot: Path | None = None,
-                       json_path: Path | None = None, report: Path | None = None,
-                       params: Path | None = None, console: Console | None = None) -> dict:
-    """
-    Identify a rotor's thrust, torque and lag from logs of a force-torque stand.
-
-    Arguments are those of `beetle_omni identify rotor`.
-
-    Returns:
-        ``verdict``, ``surface``, ``plateaus``, ``torque``, ``torque_to_thrust_ratio``, ``lag``,
-        ``temperature``, ``warnings`` and ``meta``.
-
-    Raises:
-        LogError, ParameterError: unusable input.
-
-    """
-    console = console or Terminal()
-    check_differs(params, robot)
-    robot_parameters = RobotParameters.load(robot)
-    mapping = chosen(columns)
-    model = of_rotor.identify_rotor([read_rotor_log(path, mapping, rate) for path in paths])
-    results = of_rotor.rotor_results(model)
-    if robot:
-        results['meta']['robot'] = str(robot)
-    _print(console, of_rotor.grids(results), [f'verdict: {results["verdict"]}', *(
-        f'warning: {w}' for w in results['warnings'])])
-    write_json(json_path, results)
-    if report:
-        write_text(report, of_rotor.rotor_page(model, robot_parameters, results), 'report')
-    if params:
-        write_measured(params, robot_parameters, robot,
-                       _line('rotor', paths, robot, params, rate, columns), paths, None,
-                       rotor_values(results))
-    return results
-
-
-def run_identify_robot(paths: Sequence[Path], params: Path, *, rate: float | None = None,
-                       robot: Path | None = None, json_path: Path | None = None,
-                       report: Path | None = None, console: Console | None = None) -> dict:
-    """
-    Write a robot file from logs of servos and rotors.
-
-    Arguments are those of `beetle_omni identify robot`.
-
-    Returns:
-        ``robot``, the content of the file; ``servos`` and ``rotor``, the results of `identify
-        joint` and `identify rotor`; ``warnings``.
-
-    Raises:
-        LogError, ParameterError: unusable input.
-
-    """
-    console = console or Terminal()
-    check_differs(params, robot)
-    robot_parameters = RobotParameters.load(robot)
-    joints, rotors, notes = read_logs(paths, rate)
+    parameters = RobotParameters.load(robot)
+    joints, rotors, notes = read_logs(what, paths, chosen(columns), rate)
+    others = [read_joint_log(path) for path in validate]
     results: dict = {'servos': None, 'rotor': None, 'warnings': notes}
+    tables, sections, texts = [], [], [f'warning: {note}' for note in notes]
     servo = rotor = None
-    tables, sections = [], []
     if joints:
         with console.status('identifying the servos'):
-            found = identify(joints, robot_parameters, as_file=True)
-            servo = servo_values(found, robot_parameters)
-        results['servos'] = joint_results(found, [], robot_parameters)
+            search = of_joints.identify(joints, parameters, as_file=whole)
+            servo = servo_values(search, parameters) if params else None
+        results['servos'] = of_joints.joint_results(search, others, parameters)
         tables += of_joints.grids(results['servos'])
-        sections += of_joints.joint_sections(found, [], robot_parameters) if report else []
+        sections += of_joints.sections(search, others, parameters) if report else []
+        texts += [] if whole else results['servos']['text']
     if rotors:
         model = of_rotor.identify_rotor(rotors)
         results['rotor'] = of_rotor.rotor_results(model)
         rotor = rotor_values(results['rotor'])
         tables += of_rotor.grids(results['rotor'])
-        sections += of_rotor.rotor_sections(model, robot_parameters) if report else []
-    results['robot'] = write_measured(params, robot_parameters, robot, _line(
-        'robot', paths, robot, params, rate), paths, servo, rotor)
-    if joints:
+        sections += of_rotor.sections(model, parameters) if report else []
+        texts += [] if whole else [f'verdict: {results["rotor"]["verdict"]}', *(
+            f'warning: {warning}' for warning in results['rotor']['warnings'])]
+    if params:
+        results['robot'] = write_measured(params, parameters, robot, _line(
+            what, paths, robot, params, rate, columns), paths, servo, rotor)
+    if whole and joints:
         tables.append(of_joints.flown_errors(joints, {
-            robot.stem if robot else 'published': robot_parameters,
+            robot.stem if robot else 'published': parameters,
             'measured': RobotParameters.load(params)}))
-    _print(console, tables, [f'warning: {note}' for note in notes])
+    for part in (results['servos'], results['rotor']):
+        if part and robot:
+            part['meta']['robot'] = str(robot)
+    print_grids(tables, console)
+    for text in texts:
+        console.print(text, highlight=False, markup=False)
+    results = results if whole else results['servos' if joints else 'rotor']
     write_json(json_path, results)
     if report:
-        write_text(report, page('Robot', f'identified for {params.name}', tables, notes, sections),
-                   'report')
+        about = f'identified for {params.name}' if params and whole else \
+            f'identified from {", ".join(log.name for log in [*joints, *rotors])}'
+        write_text(report, page(TITLES[what], about, tables, texts, sections), 'report')
     return results
 
 
-def _line(what, paths, robot, params, rate=None, columns=()):
+def _line(what, paths, robot, params, rate, columns):
     """The command, for the written file."""
     options = (('--rate', f'{rate:g}' if rate else None), ('--robot', robot), ('--params', params))
     return shlex.join(map(str, (
         'beetle_omni', 'identify', what, *paths, *(x for c in columns for x in ('--column', c)),
         *(x for name, value in options if value for x in (name, value)))))
-
-
-def _print(console, tables, notes):
-    print_grids(tables, console)
-    for note in notes:
-        console.print(note, highlight=False, markup=False)

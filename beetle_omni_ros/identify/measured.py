@@ -5,7 +5,7 @@ A value is that of servos with the same gains in all logs. Its interval also cov
 differ between logs, because a log seldom separates bandwidth, damping and delay.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import hashlib
 from pathlib import Path
@@ -16,12 +16,10 @@ import numpy as np
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.identify.rotor.log import COLUMNS, EXPECTED, read_rotor_log, UntimedError
-from beetle_omni_ros.identify.servo.fit import decoded, Found, HIGH, LOW, STARTS, Trial
+from beetle_omni_ros.identify.servo.fit import decoded, HIGH, LOW, Search, ServoModel, STARTS
 from beetle_omni_ros.identify.servo.log import HEADER, is_bag, read_joint_log
-from beetle_omni_ros.identify.servo.model import INDEX
-from beetle_omni_ros.identify.servo.robot import catalogue_values, JOINTS, own_delay
-from beetle_omni_ros.model.catalogue import settings
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.identify.servo.model import catalogue_values, INDEX, JOINTS, own_delay
+from beetle_omni_ros.model.effects import CATALOGUE, settings
 from beetle_omni_ros.model.files import LogError
 from beetle_omni_ros.model.parameters import RobotParameters, TILT_LAG
 
@@ -40,13 +38,16 @@ HEAD = """\
 """
 
 
-def read_logs(paths: Sequence[Path], rate: float | None) -> tuple[list, list, list[str]]:
+def read_logs(what: str, paths: Sequence[Path], columns: Mapping[str, tuple[str, float]],
+              rate: float | None) -> tuple[list, list, list[str]]:
     """
-    Read logs of joints and of rotors, recognised by their header.
+    Read logs of joints and of rotors.
 
     Args:
+        what: `joint` or `rotor`, the kind of all logs, or `robot`: the header decides.
         paths: CSV files, or bags with responses of the joints.
-        rate: rows a second of time series without times [Hz]; None: they are left out.
+        columns: of rotors, see :func:`chosen`.
+        rate: rows a second of time series without times [Hz]; None: `robot` leaves them out.
 
     Returns:
         logs of joints, logs of rotors, and sentences about logs that were left out.
@@ -57,17 +58,19 @@ def read_logs(paths: Sequence[Path], rate: float | None) -> tuple[list, list, li
     """
     joints, rotors, notes = [], [], []
     for path in paths:
-        if is_bag(path) or _names(path, r'q\d_rad'):
+        if what == 'joint' or what == 'robot' and (is_bag(path) or _names(path, r'q\d_rad')):
             joints.append(read_joint_log(path))
-        elif path.is_file() and not _names(path, r'(rotor\d+_)?({})'.format(
-                '|'.join(COLUMNS['thrust']))):
+            continue
+        thrust = r'(rotor\d+_)?({})'.format('|'.join(COLUMNS['thrust']))
+        if what == 'robot' and path.is_file() and not _names(path, thrust):
             raise LogError(f'{path}: expected the header of a log of joints ({HEADER}) or of a '
                            f'rotor ({EXPECTED})')
-        else:
-            try:
-                rotors.append(read_rotor_log(path, rate=rate))
-            except UntimedError as error:
-                notes.append(f'not used: {error}')
+        try:
+            rotors.append(read_rotor_log(path, columns, rate))
+        except UntimedError as error:
+            if what == 'rotor':
+                raise
+            notes.append(f'not used: {error}')
     return joints, rotors, notes
 
 
@@ -81,7 +84,7 @@ def _names(path, pattern):
     return any(re.fullmatch(pattern, cell.strip(' \ufeff\n')) for cell in line.split(','))
 
 
-def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict]:
+def servo_values(search: Search, robot: RobotParameters) -> tuple[dict, dict, dict]:
     """
     Effects of the selected servo model.
 
@@ -92,16 +95,16 @@ def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict
         ``effects``, ``intervals`` and the origin of each, by dotted key.
 
     """
-    servos = found.servos
+    servos = search.servos
     spreads = list(servos.spreads)
     for p in (INDEX[name] for name in GAINS):
         spreads[p] = replace(spreads[p], groups=spreads[p].groups | {'log': BETWEEN})
     servos.spreads, kept = spreads, servos.spreads
-    apart = servos.fit(found.chosen.entries, starts=(found.chosen, *STARTS))
+    apart = servos.fit(search.chosen.entries, starts=(search.chosen, *STARTS))
     servos.spreads = kept
     # each: {entry: {parameter: (JOINTS or 1, draws)}}
-    best = _entries(found, found.chosen, None, robot, 1)
-    others = [_entries(found, trial, k, robot, DRAWS) for trial in (found.chosen, apart)
+    best = _entries(search, search.chosen, None, robot, 1)
+    others = [_entries(search, trial, k, robot, DRAWS) for trial in (search.chosen, apart)
               for k in (None, *range(len(servos.logs)))]
     effects: dict = {}
     intervals, origin = {}, {}
@@ -129,25 +132,25 @@ def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict
         intervals[TILT_LAG] = [_plain(low), _plain(high)]
         origin[TILT_LAG] = how | {'how': 'Kd / Kp plus delay [s]; the logs determine the sum '
                                          'better than its parts'}
-    if 'joint_offset' in found.chosen.entries:
-        zeros = MILLI * found.values()[:, INDEX['offset']]
+    if 'joint_offset' in search.chosen.entries:
+        zeros = MILLI * search.values()[:, INDEX['offset']]
         origin['not written: joint_offset'] = how | {
             'how': f'zeros of {zeros.min():.1f} to {zeros.max():.1f} mrad; each homing sets them'}
-    delay = found.values()[:, INDEX['delay']].mean()
+    delay = search.values()[:, INDEX['delay']].mean()
     origin['effects.joint_command_latency.delay'] = how | {
         'how': f'{delay:.4f} s in the mean of the logs, minus {own_delay():.3f} s that the '
                'simulator has; at least 0'}
     return effects, intervals, origin
 
 
-def _entries(found: Found, trial: Trial, log: int | None, robot: RobotParameters, draws: int
+def _entries(search: Search, trial: ServoModel, log: int | None, robot: RobotParameters, draws: int
              ) -> dict[str, dict[str, np.ndarray]]:
     """
     Entries of a log, or of the mean of all logs (None): (joints, draws) values of each parameter.
 
     One draw is the estimate. A joint without a log is the median of the others.
     """
-    fit, units = trial.fit, found.servos.units
+    fit, units = trial.fit, search.servos.units
     x = fit.x[:, None]
     if draws > 1:
         factor = np.linalg.cholesky(fit.covariance() + 1e-12 * np.eye(len(fit.x)))
@@ -156,7 +159,7 @@ def _entries(found: Found, trial: Trial, log: int | None, robot: RobotParameters
     for number in range(1, JOINTS + 1):
         mine = [u for u, (k, _, n) in enumerate(units) if n == number and log in (None, k)]
         if mine:
-            sets.append(found.servos.base[mine[0]][:, None] + fit.s[mine].mean(axis=0) @ x)
+            sets.append(search.servos.base[mine[0]][:, None] + fit.s[mine].mean(axis=0) @ x)
     logs = decoded(np.clip(np.array(sets), LOW[:, None], HIGH[:, None]).transpose(0, 2, 1))
     values = catalogue_values(logs.transpose(2, 0, 1), robot)
     result: dict[str, dict[str, np.ndarray]] = {}

@@ -137,23 +137,14 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
         ca.densify(ca.cse(ca.vertcat(*acting) - ca.vertcat(*without)))], list(x), ['wrench'])
 
 
-def gyroscopic_load(robot: RobotParameters, angular_velocity, tilt, thrust, joint: int):
-    """Load on a tilt joint for each N m s of its rotor's angular momentum in hover [rad/s]."""
-    n = thrust_direction(robot.rotors.arm_yaw[joint], tilt)
-    speed = ca.sqrt(ca.fmax(thrust, 0) / robot.hover_thrust + 1e-9)
-    return -float(robot.rotors.spin[joint]) * speed * ca.dot(
-        ca.DM(robot.tilt_axes[joint]), ca.cross(angular_velocity, n))
-
-
-def tilt_servo(robot: RobotParameters, joint: int, target, thrust=0.0,
-               gyroscopic=0.0) -> tuple[Servo, ServoTerms]:
+def tilt_servo(robot: RobotParameters, joint: int, target,
+               thrust=0.0) -> tuple[Servo, ServoTerms]:
     """
     Servo of a joint (0 to 3) and the terms that act on it, with the robot file's effects.
 
-    ``target`` is the commanded angle [rad], ``thrust`` that of the joint's rotor [N],
-    ``gyroscopic`` the value of :func:`gyroscopic_load` [rad/s].
+    ``target`` is the commanded angle [rad], ``thrust`` that of the joint's rotor [N].
     """
-    terms = ServoTerms(target, thrust, gyroscopic)
+    terms = ServoTerms(target, thrust)
     for name, values in robot.effects.items():
         act = CATALOGUE[name].servo
         if act is not None:
@@ -172,8 +163,7 @@ def full_model(robot: RobotParameters) -> ca.Function:
                             robot.rotors.thrust_max)
     accelerations = []
     for i in range(4):
-        servo, terms = tilt_servo(robot, i, target[i], x[THRUST][i], gyroscopic_load(
-            robot, x[RATE], x[TILT][i], x[THRUST][i], i))
+        servo, terms = tilt_servo(robot, i, target[i], x[THRUST][i])
         accelerations.append(servo.acceleration(
             CASADI, terms.target, x[TILT][i], x[TILT_RATE][i], terms.load))
     tilt_acceleration = ca.vertcat(*accelerations)

@@ -1,9 +1,10 @@
-"""The state of the supervisor as a type; on the wire it is a text."""
+"""The state of the supervisor, a text on the wire, and the age limit of its commands."""
 
 DISARMED, TAKEOFF, FLYING = 'disarmed', 'takeoff', 'flying'
 FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
 IN_FLIGHT = (TAKEOFF, FLYING, FALLBACK, LANDING)
 MOTORS_OFF = (DISARMED, STOPPED)
+COMMAND_AGE = 0.1       # [s] from the stamp: no older command is sent or executed by any actuator
 
 
 class Mode(str):

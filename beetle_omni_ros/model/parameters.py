@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from beetle_omni_ros.model import catalogue, schema
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model import schema
+from beetle_omni_ros.model.effects import CATALOGUE, delaying, settings, validated
 from beetle_omni_ros.model.parts import (
     BatteryParameters,
     JointParameters,
@@ -50,8 +50,8 @@ class RobotParameters:
 
     def __post_init__(self):
         """Validate the effects and set the numbers that they replace."""
-        object.__setattr__(self, 'effects', catalogue.validated(self.effects))
-        for key, value in catalogue.settings(self.effects).items():
+        object.__setattr__(self, 'effects', validated(self.effects))
+        for key, value in settings(self.effects).items():
             part, name = key.split('.')
             object.__setattr__(self, part, replace(getattr(self, part), **{
                 name: np.array(value) if np.ndim(value) else value}))
@@ -122,7 +122,7 @@ class RobotParameters:
             raise ParameterError(f'{path}: {error}') from None
         # not in __post_init__, because copies without some effects keep the others' intervals
         intervals = {key: pair for key, pair in robot.intervals.items()
-                     if key not in catalogue.settings(robot.effects)}
+                     if key not in settings(robot.effects)}
         for key, pair in intervals.items():
             try:
                 value = np.array(value_of(robot, key), dtype=float)
@@ -170,7 +170,7 @@ class RobotParameters:
     @property
     def command_delays(self) -> tuple[float, float]:
         """Delays of tilt and of thrust commands [s] by the effects."""
-        tilt, thrust = (sum(self.effect(f'{name}.delay', 0.0) for name in catalogue.delaying(what))
+        tilt, thrust = (sum(self.effect(f'{name}.delay', 0.0) for name in delaying(what))
                         for what in ('tilt', 'thrust'))
         return tilt, thrust
 

@@ -16,7 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.model.catalogue import delaying
+from beetle_omni_ros.model.effects import delaying
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.parts import JointParameters
 
@@ -39,8 +39,6 @@ class Servo:
     position_limit: Any = None  # travel to each side [rad]
     coulomb: Any = None         # sliding friction [N m]
     stiction: Any = None        # friction at rest [N m]
-    fading_rate: Any = SLIDING_RATE     # over which stiction falls to sliding friction [rad/s]
-    gaussian: bool = True       # stiction fades as exp(-x^2), else as exp(-|x|), x = rate / fading
 
     @classmethod
     def of(cls, joints: JointParameters, **more) -> Servo:
@@ -54,8 +52,8 @@ class Servo:
 
     def fading(self, space, rate):
         """Remaining fraction of the excess of stiction at a rate."""
-        x = rate / self.fading_rate
-        return space.exp(-x * x if self.gaussian else space.minimum(x, -x))
+        x = rate / SLIDING_RATE
+        return space.exp(-x * x)
 
     def motor(self, space, error, rate):
         """Torque of the motor [N m] at a position error [rad] and a rate [rad/s]."""

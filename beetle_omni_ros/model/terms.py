@@ -66,7 +66,6 @@ class ServoTerms:
 
     target: Any             # commanded angle [rad]
     thrust: Any = 0.0       # of the joint's rotor [N]
-    gyroscopic: Any = 0.0   # load for each N m s of the rotor's momentum in hover [rad/s]
     load: Any = 0.0         # torque beside the motor's [N m]
     coulomb: Any = None     # sliding friction [N m]
     stiction: Any = None    # friction at rest [N m]
@@ -80,14 +79,10 @@ class EffectParameter:
     neutral: float | tuple[float, ...]      # without effect; NaN: the robot file's own number
     low: float                              # smallest and largest legal value
     high: float
-    typical: float = NAN    # realistic deviation from neutral; a fraction if neutral is NaN
-    smallest: float = NAN   # smallest significant deviation, likewise
     default: float | tuple[float, ...] | None = None    # if a file omits it; None: it is required
     of_each: bool = False   # a file may give a list of four, one for each joint
     number: str = ''        # dotted key of the robot file's number that it replaces
     sensor: str = ''        # field of SensorErrors that it sets
-    tolerance: str = ''     # between robots of one type: tolerance_... of params/gap.yaml
-    step: float = 1e-3      # of a fit's derivatives; of the logarithm for the file's own numbers
     form: bool = False      # it only chooses a form of the effect and is not fitted
 
 
@@ -132,9 +127,6 @@ class Effect:
     layer: str      # 'body', 'rotor', 'joint', 'timing' or 'sensor'
     parameters: dict[str, EffectParameter]
     source: str     # equation and its source
-    excited_by: str = ''                    # flight that shows it
-    confused_with: tuple[str, ...] = ()     # entries that poor data cannot distinguish from it
-    separated_by: str = ''                  # experiment that distinguishes them
     # Equation of a body effect, which changes Terms in place: apply(terms, **values).
     apply: Callable | None = None
     # Equation of a joint effect, which changes ServoTerms: servo(terms, joint, **values).
@@ -142,14 +134,6 @@ class Effect:
     each: str = ''      # 'rotor' or 'joint' if the parameters are (4,), one for each
     # Delayed quantities: 'tilt' and 'thrust' commands, readings of 'imu', 'mocap', 'encoders'.
     delays: tuple[str, ...] = ()
-    # Affected measurements. B: forces and torques, J: joints, A: MoCap's acceleration, W: MoCap's
-    # angular velocity; A and W against the IMU.
-    channels: str = 'B'
-    # Start values of a fit, if the effect has no slope at its neutral value. Those of a limit are
-    # fractions of the largest 'tilt_rate', 'torque' or 'thrust' of a flight, and must be below a
-    # fraction of the robot file's limit.
-    starts: tuple[tuple[float, ...], ...] = ()
-    limit: tuple[str, float] | None = None
     allocated: bool = False     # the allocation includes it
     measured: tuple[str, ...] = ()  # terms of MEASURED; where one is None, it is left out
     # Name of CONSUMERS -> why it ignores the effect, where this does not follow from its kind.

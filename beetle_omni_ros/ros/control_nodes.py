@@ -3,14 +3,12 @@
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.flight.controller import ControllerComponent
-from beetle_omni_ros.flight.estimator import Estimator
-from beetle_omni_ros.flight.supervision import SupervisorComponent
+from beetle_omni_ros.flight.stack import ControllerComponent, Estimator, SupervisorComponent
 from beetle_omni_ros.model.schema import parameter, ParameterError
 from beetle_omni_ros.ros.graph import NODES
 from beetle_omni_ros.ros.node import FlightNode
 from beetle_omni_ros.ros.parameters import file_parameter
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import SupervisorParameters
 
 
 class EkfNode(FlightNode):

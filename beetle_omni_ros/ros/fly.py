@@ -31,8 +31,7 @@ from beetle_omni_ros.ros.graph import (
 )
 from beetle_omni_ros.ros.operator import NEVER, Operator
 from beetle_omni_ros.show import table
-from beetle_omni_ros.sim.fault_lists import load_faults
-from beetle_omni_ros.sim.faults import DEVICES
+from beetle_omni_ros.sim.faults import DEVICES, load_faults
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
@@ -100,27 +99,32 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                 'robot': str(robot) if robot else 'params/robot.yaml',
                 'plant': str(plant) if plant else None, 'version': __version__,
                 'controller': controller, 'clock': clock,
-                'actuators': nodes['sim_node'].get('actuators', 'direct')}
-        if injected:
-            meta['faults'] = [str(fault) for fault in injected]
+                'actuators': nodes['sim_node'].get('actuators', 'direct'),
+                **({'faults': [str(fault) for fault in injected]} if injected else {})}
         graph = Graph(nodes, folder, number)
         failure = slow = ''
         try:
             failure, slow = _fly(graph, controller, flown_task, console, clock == 'simulated')
         except KeyboardInterrupt:
             meta['interrupted'] = True
-        if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
-            result = _report(bag, controller, flown_task, meta, json_path, console)
-            failure = failure or failed(result)
-        if 'interrupted' in meta:
-            if bag.exists():
-                _print(console, f'interrupted; kept {bag}')
-            raise KeyboardInterrupt
-        if failure:
-            _complain(failure + slow)
-        elif slow:
-            _print(console, slow.removeprefix('; '), style='yellow')
-        return runner.FAILED if failure else runner.OK
+        return _conclude(bag, flown_task, meta, failure, slow, json_path, console)
+
+
+def _conclude(bag: Path, task: Task, meta: dict, failure: str, slow: str,
+              json_path: Path | None, console: Console) -> int:
+    """Report the flight of a bag and why it failed; return the exit status."""
+    if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
+        result = _report(bag, meta['controller'], task, meta, json_path, console)
+        failure = failure or failed(result)
+    if 'interrupted' in meta:
+        if bag.exists():
+            _print(console, f'interrupted; kept {bag}')
+        raise KeyboardInterrupt
+    if failure:
+        _complain(failure + slow)
+    elif slow:
+        _print(console, slow.removeprefix('; '), style='yellow')
+    return runner.FAILED if failure else runner.OK
 
 
 def _checked(faults, actuators):

@@ -22,7 +22,7 @@ import yaml
 
 import beetle_omni_ros
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.flight.plugin import component_class, node_name
+from beetle_omni_ros.flight.component import component_class, node_name
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 
@@ -146,7 +146,8 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
         'controllers': [active, *registry.STANDING_BY]}
     bridges = bridge_parameters(Path(ports), robot) if emulated else {}
     table = (
-        ('recorder_node', bag, {'bag': bag, **others}),
+        ('recorder_node', bag, {'bag': bag, **others,
+                                **({'components': list(components)} if components else {})}),
         ('ekf_node', True, robot),
         *((name, True, values) for name, values in controllers.items()),
         ('supervisor_node', True, {**robot, 'controller': active, **others}),

@@ -10,10 +10,9 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from beetle_omni_ros.bags.messages import MessageError
 from beetle_omni_ros.bags.topics import topic_of
-from beetle_omni_ros.bags.values import MessageError
-from beetle_omni_ros.flight.component import Component, DIAGNOSTICS_PERIOD
-from beetle_omni_ros.flight.plugin import node_name
+from beetle_omni_ros.flight.component import Component, DIAGNOSTICS_PERIOD, node_name
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import parameter
 from beetle_omni_ros.ros import parameters, wire
@@ -113,7 +112,7 @@ class FlightNode(Node):
         self._outputs[topic].publish(value, source or None)
 
     def log(self, severity: str, text: str) -> None:
-        """Log ``text`` with a severity of :mod:`~beetle_omni_ros.supervisor.events`."""
+        """Log ``text`` with a severity of :mod:`~beetle_omni_ros.supervisor.interface`."""
         # One call for each severity: rclpy ties a severity to the line of the call.
         logger = self.get_logger()
         if severity == 'error':

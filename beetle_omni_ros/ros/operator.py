@@ -18,8 +18,8 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.bags.conversions import seconds as seconds_of
-from beetle_omni_ros.bags.topics import LOG, Qos, SENSOR, TARGETS, TOPICS
-from beetle_omni_ros.bags.values import Diagnostic, MessageError
+from beetle_omni_ros.bags.messages import Diagnostic, MessageError
+from beetle_omni_ros.bags.topics import ALL, LOG, Qos, SENSOR, TARGETS
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.drivers import findings
 from beetle_omni_ros.model.mode import DISARMED, Mode
@@ -255,7 +255,7 @@ def listen(seconds: float, namespace: str = '') -> findings.ObservedGraph:
                                        {topic: findings.Stream() for topic in SENSORS})
         for topic in SENSORS:
             wire.subscribe_raw(node, topic, partial(
-                _observe, node, TOPICS[topic], graph.streams[topic]), LOG)
+                _observe, node, ALL[topic], graph.streams[topic]), LOG)
         for bridge in findings.BRIDGES:
             wire.subscribe(node, f'{bridge}/state', partial(graph.states.__setitem__, bridge))
         wire.subscribe(node, 'diagnostics', lambda statuses: graph.diagnostics.update(
@@ -263,7 +263,7 @@ def listen(seconds: float, namespace: str = '') -> findings.ObservedGraph:
         client.spin_steadily(seconds)
         for topic, stream in graph.streams.items():
             for publisher in node.get_publishers_info_by_topic(topic):
-                if publisher.topic_type == TOPICS[topic].type:
+                if publisher.topic_type == ALL[topic].type:
                     stream.publishers.append(publisher.node_name)
                 elif publisher.topic_type not in stream.other_types:
                     stream.other_types.append(publisher.topic_type)

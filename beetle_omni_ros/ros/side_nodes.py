@@ -6,11 +6,11 @@ import sys
 from rcl_interfaces.srv import SetParameters
 
 from beetle_omni_ros.bags.bag_writer import BagWriter, FRAMES, FrameWriter
-from beetle_omni_ros.bags.topics import ALL, LATCHED_LOG, LOG, SENSOR, topics_with
+from beetle_omni_ros.bags.topics import LATCHED_LOG, LOG, SENSOR, topics_with
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task
-from beetle_omni_ros.flight.component import Component, ERROR, OK, WARN
-from beetle_omni_ros.flight.reference import Reference
+from beetle_omni_ros.flight.component import Component, component_class, ERROR, OK, WARN
+from beetle_omni_ros.flight.surroundings import TaskReference
 from beetle_omni_ros.model.schema import parameter, RunError
 from beetle_omni_ros.ros import wire
 from beetle_omni_ros.ros.node import FlightNode
@@ -29,7 +29,7 @@ class ReferenceNode(FlightNode):
             task=parameter('hover', doc='name of a task, or a CSV file of poses'),
             seed=parameter(0, doc='seed of random poses', low=0, high=2**31 - 1))
         payload = self.create_client(SetParameters, 'sim_node/set_parameters')
-        self.run(Reference(
+        self.run(TaskReference(
             make_task(self.parameters.task, self.parameters.seed),
             lambda mass: payload.call_async(wire.parameter_request('payload', mass))))
 
@@ -42,7 +42,10 @@ class RecorderNode(FlightNode):
             'recorder_node',
             bag=parameter(doc='folder to create for the bag'),
             controllers=parameter(registry.STANDING_BY,
-                                  doc='registered controllers whose commands are recorded'))
+                                  doc='registered controllers whose commands are recorded'),
+            components=parameter((), doc='components whose topics are recorded: FILE.py:Class'))
+        for reference in self.parameters.components:
+            component_class(reference)      # its module registers its topics
         topics = topics_with(self.parameters.controllers)
         self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
                               topics=tuple(topics), frames=True)
@@ -50,7 +53,7 @@ class RecorderNode(FlightNode):
         self._failure = None
         self._received = []     # (topic, type, CDR, time of receipt [s]) not yet written
         prefix = self.get_namespace().rstrip('/') + '/'
-        for name, topic in {**ALL, **topics}.items():
+        for name, topic in topics.items():
             wire.subscribe_raw(self, name, partial(self._keep, prefix + name, topic.type),
                                LATCHED_LOG if topic.qos.latched else LOG, self._on_lost)
         self.create_subscription(wire.message_class(LINE), '/rosout', partial(

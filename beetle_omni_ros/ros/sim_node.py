@@ -11,15 +11,14 @@ from beetle_omni_ros.bags.conversions import set_time
 from beetle_omni_ros.bags.topics import SENSOR
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.flight.component import OK, WARN
-from beetle_omni_ros.flight.simulated import SimulatedRobot
+from beetle_omni_ros.flight.surroundings import SimulatedRobot
 from beetle_omni_ros.model.schema import group, parameter, ParameterError, RunError
 from beetle_omni_ros.ros import wire
 from beetle_omni_ros.ros.node import FlightNode
 from beetle_omni_ros.ros.parameters import file_parameter
 from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
 from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
-from beetle_omni_ros.sim.fault_lists import parse_faults
-from beetle_omni_ros.sim.faults import DEVICES
+from beetle_omni_ros.sim.faults import DEVICES, parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 

@@ -15,9 +15,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from beetle_omni_ros.bags.bag_types import from_bytes, to_bytes
+from beetle_omni_ros.bags.messages import from_bytes, MessageError, to_bytes
 from beetle_omni_ros.bags.topics import Qos, TARGETS, Topic, topic_of
-from beetle_omni_ros.bags.values import MessageError
 
 COPIES = 64             # newest messages that are compared to detect a copy
 QUIET = 2.0             # s between two warnings of a kind

@@ -130,9 +130,9 @@ def _charts(runs):
     made += _poses(runs)
     for kind in ('tilt command [rad]', 'thrust command [N]'):
         for run in runs:
-            values = getattr(run.log, f'command_{kind.partition(" ")[0]}')
+            values = getattr(run.log.command, kind.partition(' ')[0])
             made.append((f'{run.label}: {kind}' if len(runs) > 1 else kind, [
-                run.line(run.log.command_t, values[:, k], str(k + 1), color=PARTS[k], width=1)
+                run.line(run.log.command.t, values[:, k], str(k + 1), color=PARTS[k], width=1)
                 for k in range(4) if len(values)]))
     made.append(('CPU time of a step: median, 99 %, largest [ms]', [
         run.line(*np.array([(t, report[key]) for t, report in history], dtype=float).T,
@@ -144,10 +144,10 @@ def _charts(runs):
     made += [(f'error of the estimated {name}', [run.line(found[0], scale * found[k])
                                                  for run, found in estimates if len(found[0])])
              for k, name, scale in ((1, 'position [mm]', 1e3), (2, 'orientation [deg]', 1.0))]
-    made += [(label, [run.line(run.log.battery_t, sign * getattr(run.log, name))
-                      for run in runs if len(run.log.battery_t)])
-             for name, sign, label in (('battery_voltage', 1, 'voltage [V]'),
-                                       ('battery_current', -1, 'current drawn [A]'))]
+    made += [(label, [run.line(run.log.battery.t, sign * getattr(run.log.battery, name))
+                      for run in runs if len(run.log.battery)])
+             for name, sign, label in (('voltage', 1, 'voltage [V]'),
+                                       ('current', -1, 'current drawn [A]'))]
     return [(label, traces) for label, traces in made if traces]
 
 

@@ -12,6 +12,17 @@ COLOURS = ('#1f5fa8', '#d1432f', '#2f8f5b', '#d98a1c', '#7a52a3', '#5b6770')  # 
 PARTS = ('#1f5fa8', '#d98a1c', '#2f8f5b', '#b0447a')  # one for each joint, rotor or axis
 INK, FAINT = '#22272e', '#8a939d'
 WIDTH = 9.6  # [in] of a page-wide figure
+# Controller -> colour and dashes: blue for RL and red for NMPC as in the publication. The variants
+# are lighter and dashed, so that readers who cannot distinguish the colours can also read them.
+LINES: dict[str, tuple[str, str | tuple]] = {
+    'nmpc': ('#c8281e', '-'),
+    'rl': ('#1b5fb4', '-'),
+    'rl_bare': ('#0b2d5c', (0, (2, 1))),
+    'rl_any': ('#58b4e8', (0, (5, 1.6))),
+    'rl_published': ('#3f8f8a', (0, (4, 1, 1, 1))),
+    'nmpc_corrected': ('#b5651d', (0, (5, 1.2))),
+    'nmpc_published': ('#e8960c', (0, (3, 1.2, 1, 1.2))),
+    'hover': ('#5b6770', (0, (1, 1.2)))}
 
 STYLE: dict[Any, Any] = {
     'font.family': 'sans-serif', 'font.size': 9, 'axes.titlesize': 9.5, 'axes.titleweight': 'bold',

@@ -53,7 +53,7 @@ def run_view(runs: list[Path], *, host: str, port: int) -> None:
     """Serve a player of recorded runs until Ctrl-C; a ParameterError reports unusable input."""
     page = recorded_scene(read_flights(runs, len(COLOURS))).encode()
 
-    class Answer(BaseHTTPRequestHandler):
+    class PageHandler(BaseHTTPRequestHandler):
         def do_GET(self):
             self.send_response(200)
             self.send_header('Content-Type', 'text/html; charset=utf-8')
@@ -65,7 +65,7 @@ def run_view(runs: list[Path], *, host: str, port: int) -> None:
             """Print nothing."""
 
     try:
-        server = ThreadingHTTPServer((host, port), Answer)
+        server = ThreadingHTTPServer((host, port), PageHandler)
     except OSError as error:
         raise ParameterError(f'--host {host} --port {port}: cannot be served there '
                              f'({error})') from None

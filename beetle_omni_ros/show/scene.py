@@ -73,9 +73,9 @@ def moments(log: FlightLog, times: np.ndarray) -> list[Moment | None]:
         return drawable(hold(t, values, times)) if len(t) else np.zeros((len(times), width))
 
     rows = zip(times, held(body.t, body.position, 3), held(body.t, body.quaternion, 4),
-               held(*(log.joint_t, log.joint_position) if len(log.joint_t) else
-                    (log.command_t, log.command_tilt), 4),
-               held(log.command_t, log.command_thrust, 4), held(log.wrench_t, log.wrench_force, 3))
+               held(*(log.joint.t, log.joint.position) if len(log.joint.t) else
+                    (log.command.t, log.command.tilt), 4),
+               held(log.command.t, log.command.thrust, 4), held(log.wrench.t, log.wrench.force, 3))
     made: list[Moment | None] = []
     for t, position, quaternion, tilt, thrust, force in rows:
         state = bisect_right(log.state_t, t) - 1

@@ -1,23 +1,21 @@
 """
 Forces that effects add to the simulated plant, from the equations of their sources.
 
-They are written in numpy and share no code with the CasADi model of :mod:`robot.effects`, so that
+They are written in numpy and share no code with the CasADi model of :mod:`model.effects`, so that
 an error in one of the two shows as a difference, see ``test/sim/test_agreement.py``. The thrust of
 an effect is the one that the effects before it in the catalogue leave.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from beetle_omni_ros.model import dynamics, native, rotations
-from beetle_omni_ros.model.effects import (
-    CATALOGUE,
-    EXPONENTIAL_HEIGHT,
-    LEAST_HEIGHT,
-    REFERENCE_HEIGHT,
-)
+from beetle_omni_ros.model.effects import CATALOGUE, LEAST_HEIGHT, REFERENCE_HEIGHT
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.parts import RotorParameters
 
 # Effects that only change a number of the plant's bodies, rotors and reaction torques.
 BUILT_IN = ('mass', 'inertia', 'centre_of_mass', 'module_reaction', 'thrust_coefficient',
@@ -26,58 +24,47 @@ ONES = np.ones(4)
 LEAST_SPEED = 0.1       # [1] of a rotor, relative to hover, for the rate of its angular momentum
 
 
+@dataclass
 class Instant:
     """
     The rotors and the air at one instant; effects change thrust, forces and torque in place.
 
     Rows of (4, 3) arrays are rotors, vectors are in base_link unless stated otherwise.
-
-    Attributes:
-        rotation: (3, 3) body to world; ``position`` and ``velocity`` in world [m], [m/s];
-            ``rate`` of the body [rad/s].
-        tilt, tilt_rate: (4,) of the rotors [rad], [rad/s].
-        normals: (4, 3) thrust directions.
-        thrust, thrust_rate: (4,) [N], [N/s].
-        force_world: (3,) added force in world [N].
-        force: (4, 3) added at the rotors [N]; 0.0: none.
-        torque: (3,) added [N m].
-
     """
 
-    rotation: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    rate: np.ndarray
-    tilt: np.ndarray
-    tilt_rate: np.ndarray
-    thrust: np.ndarray
-    thrust_rate: np.ndarray
-    voltage_ratio: float
+    rotors: RotorParameters
+    hover_thrust: float         # of each rotor [N]
+    sideways: np.ndarray        # (4, 3) thrust directions at tilts of 90 deg
+    rotation: np.ndarray        # (3, 3) body to world
+    position: np.ndarray        # (3,) in world [m]
+    velocity: np.ndarray        # (3,) in world [m/s]
+    rate: np.ndarray            # (3,) of the body [rad/s]
+    tilt: np.ndarray            # (4,) [rad]
+    tilt_rate: np.ndarray       # (4,) [rad/s]
+    thrust: np.ndarray          # (4,) [N]
+    thrust_rate: np.ndarray     # (4,) [N/s]
+    voltage_ratio: float        # of the pack over that of a full one
+    force_world: Any = 0.0      # (3,) added, in world [N]; 0.0: none, as the next two
+    force: Any = 0.0            # (4, 3) added at the rotors [N]
+    torque: Any = 0.0           # (3,) added [N m]
 
-    def __init__(self, robot: RobotParameters, sideways: np.ndarray, **motion: Any):
-        vars(self).update(motion)
-        self.rotors, self.hover_thrust = robot.rotors, robot.hover_thrust
-        self.force_world: Any = 0.0
-        self.force: Any = 0.0
-        self.torque: Any = 0.0
-        self.sideways = sideways
-        self.normals = directions(sideways, self.tilt)
-        self._hubs: np.ndarray | None = None
+    def __post_init__(self):
+        """Set the thrust directions (4, 3)."""
+        self.normals = directions(self.sideways, self.tilt)
 
     def speeds(self) -> np.ndarray:
         """(4,) rotor speeds relative to hover: thrust grows with the square of the speed."""
         return np.sqrt(np.maximum(self.thrust, 0.0) / self.hover_thrust)
 
+    @cached_property
     def hubs(self) -> np.ndarray:
         """(4, 3) velocities of the hubs through still air [m/s]."""
-        if self._hubs is None:
-            self._hubs = self.velocity.dot(self.rotation) \
-                - self.rotors.positions.dot(rotations.skew(self.rate))    # w x r
-        return self._hubs
+        return self.velocity.dot(self.rotation) \
+            - self.rotors.positions.dot(rotations.skew(self.rate))    # w x r
 
     def along(self) -> np.ndarray:
         """(4,) velocities of the hubs along the thrust directions [m/s]."""
-        return np.einsum('ij,ij->i', self.hubs(), self.normals)
+        return np.einsum('ij,ij->i', self.hubs, self.normals)
 
 
 def directions(sideways: np.ndarray, tilt: np.ndarray) -> np.ndarray:
@@ -112,14 +99,14 @@ def body_drag(at, coefficient):
 
 def rotor_drag(at, coefficient):
     """H-force, against the velocity in the plane of the rotor (Faessler et al. 2018)."""
-    in_plane = at.hubs() - at.along()[:, None] * at.normals
+    in_plane = at.hubs - at.along()[:, None] * at.normals
     at.force = at.force - (0.25 * coefficient * at.speeds())[:, None] * in_plane
 
 
 def rotor_hub_moment(at, coefficient):
     """Moment -k s n x v of a disc that tilts back (Leishman 2006, ch. 4)."""
     at.torque = at.torque - 0.25 * coefficient * axial(
-        (at.speeds()[:, None] * at.normals).T.dot(at.hubs()))
+        (at.speeds()[:, None] * at.normals).T.dot(at.hubs))
 
 
 def axial_inflow(at, per_rotor):
@@ -129,34 +116,31 @@ def axial_inflow(at, per_rotor):
 
 def translational_lift(at, per_rotor):
     """Thrust k |v|^2 by the flow along the disc (Leishman 2006, ch. 2)."""
-    squared = np.einsum('ij,ij->i', at.hubs(), at.hubs())
+    squared = np.einsum('ij,ij->i', at.hubs, at.hubs)
     at.thrust = at.thrust + per_rotor * (squared - at.along()**2)
 
 
-def tilt_thrust_loss(at, loss_at_60deg, cosine_share):
-    """Thrust (1 - L s(q)), s by sin^2 q or 1 - cos q, each 1 at 60 deg."""
-    shape = (1 - cosine_share) * (1 - np.cos(2 * at.tilt)) / 1.5 \
-        + cosine_share * 4 * np.sin(0.5 * at.tilt)**2
-    at.thrust = at.thrust * (1 - loss_at_60deg * shape)
+def tilt_thrust_loss(at, loss_at_60deg):
+    """Thrust (1 - L s(q)), s by sin^2 q, 1 at 60 deg."""
+    at.thrust = at.thrust * (1 - loss_at_60deg * (1 - np.cos(2 * at.tilt)) / 1.5)
 
 
-def ground_effect(at, exponential_share, **gain):
+def ground_effect(at, **gain):
     """Thrust by the height of the rotor (Cheeseman and Bennett 1955)."""
     up = at.rotation[2]     # world's z axis in base_link
     height = np.maximum(at.position[2] + at.rotors.positions.dot(up), LEAST_HEIGHT)
-    shape = (1 - exponential_share) * (REFERENCE_HEIGHT / height)**2 \
-        + exponential_share * np.exp((REFERENCE_HEIGHT - height) / EXPONENTIAL_HEIGHT)
-    at.thrust = at.thrust * (1 + gain['gain_at_0.25m'] * shape * at.normals.dot(up)**2)
+    at.thrust = at.thrust * (1 + gain['gain_at_0.25m'] * (
+        REFERENCE_HEIGHT / height * at.normals.dot(up))**2)
 
 
-def propeller_gyroscopic_torque(at, angular_momentum_at_hover, spin_up_share, joint_share):
+def propeller_gyroscopic_torque(at, angular_momentum_at_hover):
     """Torque -dH/dt of the propellers' angular momentum H, seen in an inertial frame."""
     # H = sum h n turns with the body and with the joints
     turned = directions(at.sideways, at.tilt + 0.5 * np.pi)     # derivative of n by the tilt
     momentum = angular_momentum_at_hover * at.rotors.spin * at.speeds()
     at.torque = at.torque - rotations.cross(at.rate, momentum.dot(at.normals)) \
         - (momentum * at.tilt_rate).dot(turned)
-    rotor_acceleration_torque(at, spin_up_share * angular_momentum_at_hover)
+    rotor_acceleration_torque(at, angular_momentum_at_hover)
 
 
 def rotor_acceleration_torque(at, angular_momentum_at_hover):
@@ -207,7 +191,8 @@ class AddedForces:
         ``driven`` are the motors' angles (4,) [rad], ``motion`` the fields of :class:`Instant`
         without the rotation.
         """
-        at = Instant(self._robot, self._sideways, rotation=rotations.matrix(quaternion), **motion)
+        at = Instant(self._robot.rotors, self._robot.hover_thrust, self._sideways,
+                     rotations.matrix(quaternion), **motion)
         thrust, normals = at.thrust, at.normals
         if self._has_play:
             normals = directions(self._sideways, driven)
@@ -241,24 +226,15 @@ class ServoLoads:
         self._robot = robot
         names = {name for name in robot.effects
                  if CATALOGUE[name].servo and name != 'joint_friction'}
-        self._from_model = bool(names - {'joint_deflection', 'propeller_gyroscopic_torque'})
-        self._deflection = np.array(robot.effect('joint_deflection.deflection_per_newton', 0.0))
-        share, momentum = (robot.effect(f'propeller_gyroscopic_torque.{name}', 0.0)
-                           for name in ('joint_share', 'angular_momentum_at_hover'))
-        self._momentum = share * momentum * robot.rotors.spin
-        self._sideways = np.cross(robot.tilt_axes, [0.0, 0.0, 1.0])
-        self.active = bool(self._from_model or self._deflection.any() or self._momentum.any())
+        self._from_model = bool(names - {'joint_deflection'})
+        self._deflection = robot.effect('joint_deflection.deflection_per_newton', 0.0)
+        self.active = bool(names)
 
-    def __call__(self, commanded: np.ndarray, tilt: np.ndarray, rate: np.ndarray,
-                 thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Targets [rad] and torques [N m] (4,) at the body's ``rate`` [rad/s] and true thrusts."""
+    def __call__(self, commanded: np.ndarray, thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Targets [rad] and torques [N m] (4,) at the true thrusts [N]."""
         if self._from_model:
-            terms = [dynamics.tilt_servo(
-                self._robot, i, commanded[i], thrust[i],
-                float(dynamics.gyroscopic_load(self._robot, rate, tilt[i], thrust[i], i)))[1]
-                for i in range(4)]
+            terms = [dynamics.tilt_servo(self._robot, i, commanded[i], thrust[i])[1]
+                     for i in range(4)]
             return (np.array([each.target for each in terms], dtype=float),
                     np.array([each.load for each in terms], dtype=float))
-        turned = directions(self._sideways, tilt + 0.5 * np.pi)
-        speeds = np.sqrt(np.maximum(thrust, 0.0) / self._robot.hover_thrust)
-        return commanded + self._deflection * thrust, self._momentum * speeds * turned.dot(rate)
+        return commanded + self._deflection * thrust, np.zeros(4)

@@ -12,7 +12,8 @@ from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.allocation import clipped
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.sim.faults import Drive, Fault, READINGS, ROUNDING, Schedule
+from beetle_omni_ros.sim.fault_kinds import Drive, ROUNDING
+from beetle_omni_ros.sim.faults import Fault, READINGS, Schedule
 from beetle_omni_ros.sim.parameters import draw, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.sensors import Frame, Impact, Sensors, Truth

@@ -1,14 +1,14 @@
-"""Checks of the commands of the controllers, and of the one that is sent."""
+"""Commands of the controllers: checks, silence, age; the last check of the one that is sent."""
 
-from collections import Counter
-from math import isfinite
+from collections import Counter, deque
+from dataclasses import replace
+from math import exp, inf, isfinite
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.model.allocation import clipped
+from beetle_omni_ros.model.allocation import ActuatorHealth, clipped, NO_ZEROS, ROTORS
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.supervisor.events import Lateness, Silence
 
 FROZEN = 'the same numbers again'
 JUMP = 'implausible jump'
@@ -22,6 +22,78 @@ STEP = 1.0, 7.5         # [rad] and [N] at once: ten times what a joint can turn
                         # four times what a rotor can change. A jump of tilts alone is none: by far
                         # targets on both sides a policy sets the rate of a joint
 SAME = 10               # commands or estimates in a row that are equal to the last digit
+AGES = 30               # messages: 0.3 s of commands at 100 Hz; a queue after a stall holds ten
+HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
+TILT_RATE = 9.0         # [rad/s] as in hover.yaml: below the servos' 10
+THRUST_RATE = 300.0     # [N/s] as in hover.yaml: 3 N a period
+LEAD = 0.5              # [rad] from its target a joint turns at its full rate: 50 ms of delay and
+                        # lag at 10 rad/s
+SOME = 5                # late ones, 50 ms: before the fastest detector names an actuator (60 ms)
+
+
+class Silence:
+    """
+    Time since the last message of a source.
+
+    Time is counted in ticks of the supervisor, each of limited length. After a stall of the
+    process or a change of the clock, messages in the queue are therefore processed before a source
+    is treated as failed.
+
+    Attributes:
+        elapsed: [s], inf before the first message.
+        silent: whether the silence is longer than ``limit`` [s].
+        lost: whether there were messages, and are none now.
+
+    """
+
+    def __init__(self, limit: float):
+        self.limit = limit
+        self.elapsed, self.silent, self.lost, self._fresh = inf, True, False, False
+
+    def reset(self) -> None:
+        """A message arrived within the present tick."""
+        self.elapsed, self.silent, self.lost, self._fresh = 0.0, False, False, True
+
+    def tick(self, dt: float) -> None:
+        """``dt`` seconds passed; the tick with the message is not counted."""
+        if not self._fresh:
+            self.elapsed += dt
+            self.silent = self.elapsed >= self.limit - 1e-9     # tolerance for rounding
+            self.lost = self.silent and self.elapsed < inf
+        self._fresh = False
+
+    @property
+    def text(self) -> str:
+        """For messages: 'silent for 52 ms', or 'silent since the start'."""
+        return 'silent since the start' if self.elapsed == inf else \
+            f'silent for {1000 * self.elapsed:.0f} ms'
+
+
+class Lateness:
+    """
+    Ages of the last messages of a source [s], from the IMU sample that they answer to now.
+
+    Attributes:
+        age: the median, so that single late messages have no effect.
+        late, partly: whether the median, or at least SOME ages, are above the limit.
+
+    """
+
+    def __init__(self, limit: float):
+        self._limit, self._ages = limit, deque([0.0] * AGES, AGES)
+        self.age, self.late, self.partly = 0.0, False, False
+
+    def add(self, age: float) -> None:
+        """Receive the age of a message [s], of no stamp 0."""
+        self._ages.append(age if isfinite(age) else 0.0)
+        ages, limit = sorted(self._ages), self._limit + 1e-6    # tolerance for rounding
+        self.age = ages[AGES // 2]
+        self.late, self.partly = self.age > limit, ages[-SOME] > limit
+
+    @property
+    def text(self) -> str:
+        """For messages: 'late: median age 31 ms, at most 20 ms'."""
+        return f'late: median age {1000 * self.age:.0f} ms, at most {1000 * self._limit:.0f} ms'
 
 
 class CommandStream:
@@ -135,3 +207,67 @@ def within_limits(command: Command, robot: RobotParameters) -> Command | None:
     return Command(command.stamp, clipped(command.tilt, -limit, limit),
                    clipped(command.thrust, 0.0, robot.rotors.thrust_max))
 
+
+class Output:
+    """
+    The executed command.
+
+    Attributes:
+        in_force: the last one within the limits, or None.
+        given: the same before the final check; None: the next one is checked in any case.
+        hand_over_left: longest time in which changes are still limited [s].
+        thrusts: (4,) modelled with the rotors' lag [N].
+
+    """
+
+    def __init__(self, robot: RobotParameters):
+        self._robot = robot
+        self.in_force: Command | None = None
+        self.given: Command | None = None
+        self._sent: Command | None = None
+        self.hand_over_left, self.thrusts = 0.0, np.zeros(ROTORS)
+
+    def checked(self, command: Command, health: ActuatorHealth) -> Command | None:
+        """Final check: within limits and in angles of the present encoders; None: not finite."""
+        if command is self.given:
+            return self._sent
+        self.given = command
+        self.in_force = self._sent = sent = within_limits(command, self._robot)
+        if sent is not None and health.zeros != NO_ZEROS:   # an encoder has jumped
+            limit = self._robot.joints.position_limit
+            self._sent = replace(sent, tilt=clipped(health.read(sent.tilt), -limit, limit))
+        return self._sent
+
+    def hand_over(self, asked: Command) -> Command:
+        """
+        Limit the change from the executed command after a change of the controller.
+
+        A controller on standby has similar commands, but in a large turn they may differ. The
+        limit ends when the new command is reached, or after HANDOVER_TIME.
+        """
+        before = self.in_force
+        if self.hand_over_left <= 0 or before is None:
+            return asked
+        step = asked.stamp - before.stamp
+        if step <= 0:       # a command for this state was already executed
+            return before
+        self.hand_over_left -= step
+        change = np.concatenate([asked.tilt - before.tilt, asked.thrust - before.thrust])
+        reach = step * np.repeat([TILT_RATE, THRUST_RATE], ROTORS)
+        if (np.abs(change) <= reach).all():
+            self.hand_over_left = 0.0
+            return asked
+        change = np.clip(change, -reach, reach)
+        return Command(asked.stamp, before.tilt + change[:ROTORS], before.thrust + change[ROTORS:])
+
+    def pull_back(self, tilt: np.ndarray) -> None:
+        """Continue from the joints at ``tilt`` (4,) [rad], as the last command may be far away."""
+        if self.in_force is not None:
+            self.in_force = replace(self.in_force, tilt=clipped(
+                self.in_force.tilt, tilt - LEAD, tilt + LEAD))
+            self.given = None
+
+    def turn_rotors(self, dt: float, command: Command | None) -> None:
+        """Advance the modelled thrusts by ``dt`` [s] under a command, None: no thrust."""
+        share = 1 - exp(-dt / self._robot.rotors.time_constant)
+        self.thrusts += share * ((0.0 if command is None else command.thrust) - self.thrusts)

@@ -21,8 +21,7 @@ from beetle_omni_ros.model.allocation import (
 from beetle_omni_ros.model.degraded import sphere
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.thrust_map import ThrustMap
-from beetle_omni_ros.supervisor.readings import JointWatch, MocapWatch
-from beetle_omni_ros.supervisor.speeds import SpeedWatch
+from beetle_omni_ros.supervisor.readings import JointWatch, MocapWatch, SpeedWatch
 from beetle_omni_ros.supervisor.wrench import ContactWatch, NEAR_GROUND, WrenchWatch
 
 NOTICEABLE = 0.3        # [N] change of a held thrust or of the pack's limit that is not reported

@@ -10,15 +10,21 @@ from math import dist, hypot, isfinite
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, corrected, State
+from beetle_omni_ros.estimation.inputs import SpikeFilter
 from beetle_omni_ros.model import rotations
-from beetle_omni_ros.model.allocation import ActuatorHealth, Allocator, ROTORS
+from beetle_omni_ros.model.allocation import ActuatorHealth, Allocator
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.readings import SpikeFilter
 from beetle_omni_ros.supervisor.backup import BackupEstimator
-from beetle_omni_ros.supervisor.commands import CommandStream, FROZEN, JUMP, SAME
+from beetle_omni_ros.supervisor.commands import (
+    CommandStream,
+    FROZEN,
+    JUMP,
+    Lateness,
+    SAME,
+    Silence,
+)
 from beetle_omni_ros.supervisor.detectors import FaultWatch
-from beetle_omni_ros.supervisor.events import Event, INFO, Lateness, Silence, WARNING
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import Event, INFO, SupervisorParameters, WARNING
 from beetle_omni_ros.supervisor.way import inclination
 
 TICK_LIMIT = 0.02       # [s] a longer pause of the supervisor counts as this for the sources
@@ -55,7 +61,6 @@ class Inputs:
     Attributes:
         events: what happened, oldest first.
         faults: of this flight: name -> time of detection [s].
-        active: name of the selected controller.
         estimate: the last valid one; before the first at the origin, of an infinite age.
         bridges: bridge 'joint' or 'rotor' -> its reported state; a bridge that never reported has
             no influence, because without bridges the simulator gets the commands directly.
@@ -64,8 +69,7 @@ class Inputs:
         ages: of the estimates, also of refused ones.
         refused: 'estimate: stale stamp' and the like -> count.
         floor: height of base_link on the ground before the flight [m].
-        thrusts: (4,) modelled with the rotors' lag [N].
-        airborne: whether the robot is in the air, by the state machine.
+        airborne: whether the robot is in the air. The supervisor sets this and the floor.
 
     """
 
@@ -79,8 +83,6 @@ class Inputs:
         self.faults = self.watch.faults
         self.ages = Lateness(parameters.age_limit)
         self.streams = {name: CommandStream(robot, parameters.age_limit) for name in controllers}
-        self.active = parameters.controller if parameters.controller in controllers \
-            else controllers[0]
         self.backup = BackupEstimator(robot.gravity)
         self.estimate = State(-np.inf, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]),
                               np.zeros(3), np.zeros(4), np.zeros(4), -np.inf)
@@ -98,10 +100,8 @@ class Inputs:
         self._same = self._same_samples = 0     # equal estimates and IMU samples in a row
         self._sample: list[float] = []
         self._spikes = SpikeFilter()
-        self._in_force: Command | None = None
-        self.floor, self.thrusts = 0.0, np.zeros(ROTORS)
+        self.floor, self.airborne = 0.0, False
         self._now: float | None = None
-        self.airborne = False
 
     # Messages ---------------------------------------------------------------------------------
 
@@ -244,11 +244,10 @@ class Inputs:
         """Health of the actuators by the detectors."""
         return self.watch.health
 
-    @property
-    def late(self) -> tuple[str, str] | None:
+    def late(self, controller: str) -> tuple[str, str] | None:
         """Name of the fault and its text while estimates or commands stay too old."""
         for name, node, ages in (('estimates_late', 'ekf', self.ages), (
-                'commands_late', self.active, self.streams[self.active].ages)):
+                'commands_late', controller, self.streams[controller].ages)):
             if ages.late:
                 return name, f'{node}_node {ages.text}'
         return None
@@ -274,10 +273,9 @@ class Inputs:
         """Height of base_link above its height on the ground [m]; None if unknown."""
         return None if self.blind else float(self.best.position[2]) - self.floor
 
-    @property
-    def seen(self) -> State:
+    def seen(self, in_force: Command | None) -> State:
         """The best state, for the hover controller; silent joints are where they were asked to."""
-        tilt, velocity, in_force = self.tilt, self.tilt_velocity, self._in_force
+        tilt, velocity = self.tilt, self.tilt_velocity
         # Without their bridge the servos stop at their angles.
         if self.joints.silent and in_force is not None and 'joint' not in self.bridges:
             tilt, velocity = in_force.tilt, np.zeros(4)
@@ -292,7 +290,7 @@ class Inputs:
             return None
         return float(rotations.matrix(self.best.quaternion)[2].dot(self.backup.sample[1]))
 
-    def why_not_arm(self) -> str:
+    def why_not_arm(self, controller: str) -> str:
         """'' when the motors may start, else the missing condition."""
         state = self.estimate
         if unready := '; '.join(filter(None, map(self.unready, ('joint', 'rotor')))):
@@ -303,8 +301,8 @@ class Inputs:
             return f'no fresh pose (MoCap {self.mocap.text})'
         if self.joints.silent:
             return f'no fresh joint angles (joint_bridge_node {self.joints.text})'
-        if self.late:
-            return f'{self.late[1]}: the computer is too slow'
+        if late := self.late(controller):
+            return f'{late[1]}: the computer is too slow'
         angle = np.degrees(inclination(state.quaternion))
         speed, rate = np.linalg.norm(state.velocity), np.linalg.norm(state.angular_velocity)
         if angle > np.degrees(ARM_TILT):
@@ -328,9 +326,25 @@ class Inputs:
         x, y, z = map(abs, self.best.position.tolist())
         return max(x, y) > limits.fence_half_width + margin or z > limits.fence_height + margin
 
+    def diagnostics(self) -> dict[str, float | int | str]:
+        """Faults, sources and refusals, flat, for operators and logs."""
+        values: dict[str, float | int | str] = {'on_backup_estimator': int(self.backup.running)}
+        # [s]: the six digits of a diagnostic number are too few for a stamp
+        values.update({f'fault.{name}': f'{at:.3f}' for name, at in self.faults.items()})
+        values.update({f'{name}_bridge_node': state for name, state in self.bridges.items()})
+        for name, stream in self.streams.items():
+            values[f'{name}.good'] = int(stream.good)
+            values[f'{name}.silent_ms'] = 1000 * stream.silence.elapsed
+            values.update({f'{name}.refused.{reason}': count
+                           for reason, count in stream.refused.items()})
+        values.update({f'refused.{reason}': count for reason, count in self.refused.items()})
+        if self.voltage is not None:
+            values['battery_V'] = self.voltage
+        return values
+
     # Time -------------------------------------------------------------------------------------
 
-    def _tick(self, now: float) -> float:
+    def tick(self, now: float) -> float:
         """Counted time since the last update; also after the clock was set back."""
         before, self._now = self._now, now
         if before is None:

@@ -1,4 +1,4 @@
-"""Takeoff and landing, stepped by the supervisor: the way up, and the one way down."""
+"""Takeoff and landing, stepped by the supervisor: the way up, and why and how to come down."""
 
 from dataclasses import replace
 
@@ -8,13 +8,16 @@ from beetle_omni_ros.control.base import Command, Fallback, State, TrajectoryTar
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.allocation import Allocator
 from beetle_omni_ros.model.degraded import FLYING_MARGIN, Holding
-from beetle_omni_ros.supervisor.events import ERROR
+from beetle_omni_ros.supervisor.commands import Output
 from beetle_omni_ros.supervisor.inputs import Inputs
+from beetle_omni_ros.supervisor.interface import ERROR
 from beetle_omni_ros.supervisor.way import climb, coasted, halting, inclination, plan, Ramp, Way
 from beetle_omni_ros.supervisor.wrench import NEAR_GROUND
 
 ESCAPE_TIME = 1.5       # [s] of the attitude of an escape, before the turn to level
 ACCELERATION = 0.5      # [m/s^2] of climb and descent
+MOCAP_PATIENCE = 1.5    # [s] of dead reckoning until landing; its velocity error is then 0.1 m/s
+                        # and grows
 # Takeoff
 CLIMB_SPEED = 0.5       # [m/s]
 GROUND_RATE = 0.5       # [rad/s] at which an inclination of the ground is levelled
@@ -105,6 +108,30 @@ class Takeoff:
         return Command(state.stamp, self._tilt, np.zeros(4))
 
 
+def why_land(inputs: Inputs) -> tuple[str, str] | None:
+    """Text of the most urgent reason, and name of the fault, '' for one that has a name."""
+    if text := inputs.unready('rotor'):
+        return f'{text}: landing while it may follow', 'rotor_bridge_lost'
+    if 'estimator_wrong' in inputs.faults and not inputs.backup.running:
+        return 'the estimate contradicts MoCap: controlled descent on raw sensors', ''
+    if inputs.ekf.silent:
+        return f'ekf_node {inputs.ekf.text}: controlled descent on raw sensors', 'estimator_lost'
+    if 'mocap_jumped' in inputs.faults:
+        return 'MoCap jumped: landing', ''
+    if inputs.mocap.lost and inputs.mocap.elapsed > MOCAP_PATIENCE:
+        return f'MoCap {inputs.mocap.text}: landing by dead reckoning', 'mocap_lost'
+    if inputs.joints.silent or inputs.unready('joint'):
+        text = inputs.unready('joint') or f'joint_bridge_node {inputs.joints.text}'
+        return (f'{text}: landing with the joints as they are', 'joint_bridge_lost') \
+            if 'joint' in inputs.bridges else \
+            (f'{text}: landing with the joints where they were commanded', 'joints_lost')
+    if inputs.battery_empty:
+        return f'battery empty ({inputs.voltage:.1f} V): landing', 'battery_empty'
+    if inputs.outside(0.0):
+        return 'left the fence: landing', 'fence_left'
+    return None
+
+
 class Landing:
     """
     One way down from any attitude, with any remaining estimate and actuators.
@@ -116,8 +143,8 @@ class Landing:
 
     """
 
-    def __init__(self, inputs: Inputs, hover: Fallback):
-        self._inputs, self._hover = inputs, hover
+    def __init__(self, inputs: Inputs, output: Output, hover: Fallback):
+        self._inputs, self._output, self._hover = inputs, output, hover
         self.grounded, self.given_up = False, ''
         self._standing_for = self._still_for = self._blind_for = self._contradicted_for = 0.0
         self._support = 0.0     # share of the weight that the rotors do not carry, filtered
@@ -146,7 +173,7 @@ class Landing:
             backup.start(inputs.estimate)
             self.set_out()
         if not backup.running:
-            return self._follow(inputs.seen, dt)
+            return self._follow(self._seen, dt)
         for source, name in ((inputs.mocap, 'MoCap'), (inputs.imu, 'IMU')):
             if source.silent:
                 inputs.say(ERROR, f'{name} is gone too: descent without it', f'no {name}')
@@ -155,15 +182,19 @@ class Landing:
         if self._blind_for > BLIND_LIMIT:
             self.given_up = 'no estimator, no MoCap, no IMU'
         if no_imu:
-            force, torque = inputs.allocator.wrench(inputs.seen.tilt, inputs.thrusts)
+            force, torque = inputs.allocator.wrench(self._seen.tilt, self._output.thrusts)
             backup.predict(now, force / inputs.allocator.mass, torque / inputs.robot.inertia)
-        return self._follow(inputs.seen, dt)
+        return self._follow(self._seen, dt)
+
+    @property
+    def _seen(self):
+        return self._inputs.seen(self._output.in_force)
 
     # The plan ---------------------------------------------------------------------------------
 
     def set_out(self) -> None:
         """Plan the way down from the present pose, with the actuators that work."""
-        inputs, state = self._inputs, self._inputs.seen
+        inputs, state = self._inputs, self._seen
         climbed, self._halting, self._rise = self._rise > 0, False, 0.0
         if inputs.health.healthy:
             way = plan(state.quaternion, state.tilt, inputs.allocator, LEVEL_RATE)
@@ -228,7 +259,7 @@ class Landing:
         # Used only if motion is not measured: an upward wind would seem to be the ground.
         specific_force_up = inputs.specific_force_up if inputs.blind else None
         model, gravity = inputs.allocator, inputs.robot.gravity
-        force, _ = model.wrench(state.tilt, inputs.thrusts)
+        force, _ = model.wrench(state.tilt, self._output.thrusts)
         lift = float(rotations.matrix(state.quaternion)[2].dot(force)) / model.mass
         felt = gravity if specific_force_up is None else specific_force_up
         # The accelerometer jitters on the floor, by more than the weight with idle rotors.
@@ -244,7 +275,7 @@ class Landing:
         inputs, sample, contradicted = self._inputs, self._inputs.backup.sample, False
         near = inputs.height is not None and inputs.height < NEAR_GROUND
         if inputs.joints.silent and not inputs.imu.silent and sample is not None and not near:
-            force, _ = inputs.allocator.wrench(state.tilt, inputs.thrusts)
+            force, _ = inputs.allocator.wrench(state.tilt, self._output.thrusts)
             missing = np.linalg.norm(force / inputs.allocator.mass - sample[1])
             adrift = 'joint' in inputs.bridges and np.linalg.norm(state.velocity) > ADRIFT
             contradicted = bool(adrift or missing > CONTRADICTED * inputs.robot.gravity)

@@ -59,8 +59,7 @@ def _servos(robot, x, target, h, body):
     tilts, rates = [], []
     for i in range(4):
         tilt, rate, thrust = x[model.TILT][i], x[model.TILT_RATE][i], x[model.THRUST][i]
-        servo, terms = model.tilt_servo(robot, i, target[i], thrust, model.gyroscopic_load(
-            robot, x[model.RATE], tilt, thrust, i))
+        servo, terms = model.tilt_servo(robot, i, target[i], thrust)
         coulomb = body[COULOMB][i]
         step = Step(CASADI, replace(
             servo, kp=body[STIFFNESS][i], kd=body[DAMPING][i], coulomb=coulomb,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from beetle_omni_ros.bags.values import Diagnostic, Wrench
+from beetle_omni_ros.bags.messages import Diagnostic
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.body import BodyState
@@ -72,7 +72,7 @@ def _record(recorder, t, k, rng, position, quaternion, reference, controller):
     if k % 2 == 0:
         thrust = 7.45 + 0.1 * rng.normal(size=4)
         recorder.write('mocap/pose', PoseReading(t - 0.01, position, quaternion), t)
-        write_request(recorder, controller, t, tilt, thrust, received=t + 0.002)
+        recorder.write(f'{controller}/command', Command(t, tilt, thrust), t + 0.002)
         write_command(recorder, t, tilt, thrust, received=t + 0.003)
     if k % 20 == 0:
         recorder.write('battery_state', BatteryReading(t, 25.0 - 0.001 * k * TICK, -20.0))
@@ -109,16 +109,6 @@ def write_joints(recorder, t, position, velocity, effort=None, received=None):
 def write_command(recorder, t, tilt, thrust, received=None):
     """Record the selected command; ``t`` is the stamp of the estimate that it answers."""
     recorder.write('command', Command(t, tilt, thrust), received)
-
-
-def write_request(recorder, controller, t, tilt, thrust, received=None):
-    """Record a controller's command, before the supervisor."""
-    recorder.write(f'{controller}/command', Command(t, tilt, thrust), received)
-
-
-def write_wrench(recorder, t, force_world, torque_body):
-    """External wrench from ``t`` until the next."""
-    recorder.write('disturbance', Wrench(t, force_world, torque_body))
 
 
 def write_state(recorder, t, state):

@@ -19,7 +19,8 @@ from synthetic_flights import (
 )
 
 from beetle_omni_ros.bags.log import geodesic_angles, LogRecorder, roll_pitch_yaw
-from beetle_omni_ros.bags.metrics import failed, metrics, metrics_by_controller, step_response
+from beetle_omni_ros.bags.metrics import failed, metrics, metrics_by_controller
+from beetle_omni_ros.bags.task_metrics import step_response
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.control.tasks import make_task, pose_target
 from beetle_omni_ros.model import rotations

@@ -9,8 +9,8 @@ from synthetic_flights import fly
 import yaml
 
 from beetle_omni_ros.bags.bag import read_messages
-from beetle_omni_ros.bags.bag_types import from_bytes, TYPESTORE
 from beetle_omni_ros.bags.bag_writer import BagWriter
+from beetle_omni_ros.bags.messages import from_bytes, TYPESTORE
 from beetle_omni_ros.bags.topics import ALL
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.model.resources import share_path

@@ -61,7 +61,7 @@ def site(tmp_path_factory):
 def test_the_site_has_the_pages_made_from_code(site, monkeypatch):
     for page, text in (('parameters', 'rotors.time_constant'), ('topics', 'mocap/pose'),
                        ('command_line', '--controllers'), ('python', 'bo.simulate('),
-                       ('python', 'odom_quaternion')):
+                       ('python', 'angular_velocity')):
         assert text in (site / 'reference' / f'{page}.html').read_text(encoding='utf-8'), page
     monkeypatch.syspath_prepend(ROOT / 'docs')
     import generate_reference

@@ -12,7 +12,7 @@ from check_helpers import QUICK, repeated
 import serial
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.bags.values import Diagnostic
+from beetle_omni_ros.bags.messages import Diagnostic
 from beetle_omni_ros.drivers.check import run_check
 from beetle_omni_ros.drivers.findings import ObservedGraph
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
@@ -61,7 +61,7 @@ def test_a_good_robot_ends_with_status_0(robot, tmp_path, capsys):
 @pytest.mark.real_time
 def test_without_ros_the_other_parts_are_checked(robot, tmp_path, monkeypatch):
     _, _, arguments = robot
-    for name in [name for name in sys.modules if name.startswith('beetle_omni_ros.nodes')]:
+    for name in [name for name in sys.modules if name.startswith('beetle_omni_ros.ros')]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, 'rclpy', None)
     monkeypatch.setitem(sys.modules, 'diagnostic_msgs', None)

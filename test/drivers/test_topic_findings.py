@@ -4,7 +4,7 @@ from check_helpers import by_item, levels, ROBOT
 import numpy as np
 import pytest
 
-from beetle_omni_ros.bags.values import Diagnostic
+from beetle_omni_ros.bags.messages import Diagnostic
 from beetle_omni_ros.drivers.findings import check_topics, ObservedGraph, Stream
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.estimation.ekf import ImuReading, PoseReading
+from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.model import ACCELEROMETER_BIAS_STD, GYROSCOPE_BIAS_STD
 
 GRAVITY = 9.80665
@@ -154,6 +154,11 @@ def fly(seed, duration, sensors=None, agility=1.0):
     biases = sensors.biases(imu_times, rng)
     return Flight(trajectory, sensors.imu(trajectory, imu_times, biases, rng),
                   sensors.mocap(trajectory, pose_times, rng), biases)
+
+
+def new_ekf():
+    """Filter with the shipped parameters."""
+    return ErrorStateEkf(EkfParameters.load(), GRAVITY)
 
 
 def feed(ekf, sample):

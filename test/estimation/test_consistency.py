@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from ekf_flights import error_state, feed, fly, GRAVITY, run, Sensors
+from ekf_flights import error_state, feed, fly, GRAVITY, new_ekf, run, Sensors
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -59,7 +59,7 @@ def test_absolute_ros_time_does_not_change_the_estimate():
     shift = 1.8e9
     late.imu = [replace(s, stamp=s.stamp + shift) for s in late.imu]
     late.poses = [replace(s, stamp=s.stamp + shift) for s in late.poses]
-    a = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight).estimate
-    b = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), late).estimate
+    a = run(new_ekf(), flight).estimate
+    b = run(new_ekf(), late).estimate
     np.testing.assert_allclose(a.position, b.position, atol=1e-5)
     np.testing.assert_allclose(a.quaternion, b.quaternion, atol=1e-5)

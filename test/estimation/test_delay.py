@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-from ekf_flights import error_state, feed, fly, GRAVITY, run
+from ekf_flights import error_state, feed, fly, new_ekf, run
 import numpy as np
 import pytest
 
-from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, PoseReading
+from beetle_omni_ros.estimation.ekf import PoseReading
 
 
 @pytest.mark.parametrize(('delay', 'capture'), [(0.037, 0.0), (0.13, 0.0017)])
@@ -18,9 +18,9 @@ def test_replay_equals_processing_in_order(delay, capture):
                     zip(flight.poses, poses['position'], poses['rotation'].as_quat())
                     if s.stamp + capture + delay < 1.49]
     flight.delay = delay
-    late = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight).estimate
+    late = run(new_ekf(), flight).estimate
     flight.delay = 0.0
-    prompt = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight).estimate
+    prompt = run(new_ekf(), flight).estimate
     for name in ('position', 'velocity', 'quaternion'):
         np.testing.assert_allclose(getattr(late, name), getattr(prompt, name), atol=1e-9)
     np.testing.assert_allclose(late.covariance, prompt.covariance, rtol=1e-6, atol=1e-12)
@@ -30,7 +30,7 @@ def test_latency_in_imu_stamps_is_estimated_and_compensated():
     age = 0.025
     flight = fly(4, 6.0, agility=0.5)
     flight.imu = [replace(s, stamp=s.stamp + age) for s in flight.imu]
-    ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
+    ekf = run(new_ekf(), flight)
     assert ekf.status == 'tracking'
     error = error_state(replace(ekf.estimate, stamp=ekf.estimate.stamp - age), flight)
     truth = flight.trajectory(np.array([ekf.estimate.stamp, ekf.estimate.stamp - age]))
@@ -42,7 +42,7 @@ def test_a_late_angular_rate_is_extrapolated_linearly():
     """The error in motion is less than half of that of holding the last reading."""
     age, flight = 0.025, fly(4, 6.0)
     flight.imu = [replace(s, stamp=s.stamp + age) for s in flight.imu]
-    ekf, found = ErrorStateEkf(EkfParameters.load(), GRAVITY), []
+    ekf, found = new_ekf(), []
     for _, sample in flight.arrivals():
         feed(ekf, sample)
         if ekf.estimate is not None and ekf.estimate.stamp > 4.0:
@@ -58,7 +58,7 @@ def test_late_stamps_of_the_mocap_do_not_shift_the_estimate_in_time():
     flight = fly(5, 6.0, agility=0.5)
     flight.poses = [replace(s, stamp=s.stamp + 0.012) for s in flight.poses]
     flight.delay = 0.0
-    ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
+    ekf = run(new_ekf(), flight)
     assert ekf.status == 'tracking'
     error = error_state(ekf.estimate, flight)
     assert np.linalg.norm(error[:3]) < 0.004 and np.linalg.norm(error[6:9]) < np.deg2rad(0.3)

@@ -2,18 +2,13 @@
 
 from dataclasses import replace
 
-from ekf_flights import error_state, feed, fly, GRAVITY, ImuReading, run, Sensors
+from ekf_flights import error_state, feed, fly, ImuReading, new_ekf, run, Sensors
 import numpy as np
 import pytest
 
 from beetle_omni_ros.estimation import ekf as ekf_module
-from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, JUMP_POSES
+from beetle_omni_ros.estimation.ekf import EkfParameters, JUMP_POSES
 from beetle_omni_ros.model import rotations
-
-
-def new_ekf():
-    """Filter with the shipped parameters."""
-    return ErrorStateEkf(EkfParameters.load(), GRAVITY)
 
 
 def history(ekf, flight, drop=lambda time: False):

@@ -4,12 +4,11 @@ from copy import deepcopy
 from dataclasses import replace
 import warnings
 
-from ekf_flights import feed, fly, GRAVITY, run, Sensors
+from ekf_flights import feed, fly, new_ekf, run, Sensors
 import numpy as np
 import pytest
 
-from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
-from beetle_omni_ros.estimation.inputs import NoiseMonitor
+from beetle_omni_ros.estimation.inputs import LONGEST_HELD, NoiseMonitor, SpikeFilter
 from beetle_omni_ros.estimation.parameters import MocapParameters
 
 NAN, INF, HUGE = np.nan, np.inf, 1e200
@@ -19,9 +18,9 @@ NAN, INF, HUGE = np.nan, np.inf, 1e200
 def flown():
     """A flight, a filter in the middle of it, and one after it."""
     flight = fly(1, 4.0)
-    middle = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight, until=1.5)
+    middle = run(new_ekf(), flight, until=1.5)
     assert middle.status == 'tracking' and not middle.rejected
-    return flight, middle, run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
+    return flight, middle, run(new_ekf(), flight)
 
 
 @pytest.fixture
@@ -86,7 +85,7 @@ def test_a_bad_sample_is_refused_without_effect(flying, flown, kind, reason, cha
 
 def test_a_pose_older_than_the_history_is_refused():
     flight = fly(2, 1.0)
-    ekf = ErrorStateEkf(EkfParameters.load(), GRAVITY)
+    ekf = new_ekf()
     run(ekf, flight, drop=lambda time: time > 0.3)
     stale = next(s for s in flight.poses if s.stamp > 0.5)
     refused(ekf, stale, 'too_old')
@@ -99,7 +98,7 @@ def test_a_permanent_clock_jump_reinitialises_the_filter(jump):
     flight.imu = [replace(s, stamp=s.stamp + jump) if s.stamp > 2.0 else s for s in flight.imu]
     flight.poses = [replace(s, stamp=s.stamp + jump) if s.stamp > 2.0 else s
                     for s in flight.poses]
-    ekf, statuses = ErrorStateEkf(EkfParameters.load(), GRAVITY), []
+    ekf, statuses = new_ekf(), []
     events = [(0.005 * k, 0, s) for k, s in enumerate(flight.imu)]
     events += [(0.01 * k + flight.delay, 1, s) for k, s in enumerate(flight.poses)]
     for _, _, sample in sorted(events, key=lambda event: (round(event[0], 7), event[1])):
@@ -127,3 +126,39 @@ def test_excess_noise_is_estimated_for_each_measurement_kind(position, orientati
                       orientation_noise=orientation * claim.orientation_noise)
     scale = np.sqrt(scale_after(fly(2, 8.0, sensors).poses))
     np.testing.assert_allclose(scale, [position, orientation], rtol=0.25)
+
+
+# Spikes of the IMU ----------------------------------------------------------------------------
+
+LEVEL, REST = np.array([0.0, 0.0, 9.81]), np.zeros(3)
+
+
+def used(readings):
+    """Which of the readings (force, rate) pass a filter that has seen rest, and how it ended."""
+    checked = SpikeFilter()
+    assert checked.passes(LEVEL, REST)
+    return [checked.passes(*reading) for reading in readings], checked
+
+
+def test_independent_errors_in_a_row_rarely_pass():
+    random, confirmed = np.random.default_rng(0), 0
+    for _ in range(1000):
+        errors = random.normal(size=(2, 6))
+        errors *= 3 / np.linalg.norm(errors, axis=1, keepdims=True)
+        passed, _ = used([(LEVEL + 30 * error[:3], REST + 3 * error[3:]) for error in errors])
+        assert not passed[0]
+        confirmed += passed[1]
+    assert confirmed < 70       # 5 % of 1000, and three standard deviations
+
+
+def test_an_impact_that_fades_passes_with_its_second_reading():
+    passed, checked = used([(LEVEL * 20, np.array([4.0, 0, 0])),
+                            (LEVEL * 8, np.array([6.0, 1, 0]))])
+    assert passed == [False, True]
+    assert checked.passes(LEVEL * 8, np.array([6.0, 1, 0]))
+
+
+def test_readings_that_go_on_jumping_are_not_held_back_for_ever():
+    sign = np.resize([1, -1], LONGEST_HELD + 1)
+    passed, checked = used([(LEVEL + 90 * s, REST) for s in sign])
+    assert passed == [False] * LONGEST_HELD + [True]

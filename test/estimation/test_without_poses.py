@@ -1,12 +1,11 @@
 """Dead reckoning after poses whose markers are tilted, or with a biased accelerometer."""
 
 
-from ekf_flights import GRAVITY
+from ekf_flights import GRAVITY, new_ekf
 import numpy as np
 import pytest
 
 from beetle_omni_ros.estimation import model
-from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.readings import ImuReading, PoseReading
 
@@ -21,7 +20,7 @@ def half_turn(time):
 
 def rolled_over(marker_std, markers=(0.0, 0.0, 0.0), bias=(0.0, 0.0, 0.0), return_at=np.inf):
     """Filter after a hover, half a turn about x without poses, and a hover upside down."""
-    ekf = ErrorStateEkf(EkfParameters.load(), GRAVITY)
+    ekf = new_ekf()
     random, tilted = np.random.default_rng(3), rotations.exp(np.array(markers))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(model, 'MARKER_STD', marker_std)

@@ -8,7 +8,7 @@ from synthetic_flights import fly
 from beetle_omni_ros.bags.log import LogRecorder
 from beetle_omni_ros.bags.metrics import metrics
 from beetle_omni_ros.control.tasks import make_task
-from beetle_omni_ros.flight.compared_flights import Flight, trace
+from beetle_omni_ros.flight.compare import ComparedFlight, trace
 
 TASKS = ('random3', 'waypoints', 'lemniscate', 'force', 'torque', 'wind', 'pushes',
          'payload', 'hover')
@@ -44,6 +44,6 @@ def made_sweep(controllers):
         result = made(task)
         for condition, controller, seed in product(('nominal', 'published'), controllers, (0, 4)):
             factor += 0.013
-            flown[Flight(task, condition, controller, seed)] = {
+            flown[ComparedFlight(task, condition, controller, seed)] = {
                 **result, 'metrics': scaled(result['metrics'], factor)}
     return flown

@@ -1,30 +1,40 @@
 """Rules of the components, without a host of their own: what they accept, send and report."""
 
+from pathlib import Path
 import re
 
 from desk import Desk
 import numpy as np
 import pytest
 
-from beetle_omni_ros.bags.values import Wrench
+from beetle_omni_ros.bags.log import Recorder
+from beetle_omni_ros.bags.messages import Wrench
 from beetle_omni_ros.control.base import Command, PoseTarget
+from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight import component as base
-from beetle_omni_ros.flight.component import COMMAND_AGE, Component, Distribution, IDENTITY
-from beetle_omni_ros.flight.controller import ControllerComponent
-from beetle_omni_ros.flight.estimator import Estimator
-from beetle_omni_ros.flight.reference import Reference
-from beetle_omni_ros.flight.simulated import SimulatedRobot
-from beetle_omni_ros.flight.supervision import SupervisorComponent
+from beetle_omni_ros.flight.component import (
+    Component,
+    component_class,
+    Distribution,
+    IDENTITY,
+    made,
+    node_name,
+)
+from beetle_omni_ros.flight.loop import FlightLoop
+from beetle_omni_ros.flight.stack import ControllerComponent, Estimator, SupervisorComponent
+from beetle_omni_ros.flight.surroundings import SimulatedRobot, TaskReference
 from beetle_omni_ros.model.allocation import ActuatorHealth
 from beetle_omni_ros.model.body import BodyState
-from beetle_omni_ros.model.mode import Mode
+from beetle_omni_ros.model.mode import COMMAND_AGE, Mode
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.readings import ImuReading, JointReading, PoseReading
+from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.simulator import Simulator
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import SupervisorParameters
 
+OBSERVER = f"{Path(__file__).parents[2] / 'examples' / 'own_component.py'}:WrenchObserver"
 ROBOT = RobotParameters.load()
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -247,7 +257,7 @@ def test_the_supervisor_signs_its_commands_and_sends_each_once(supervisor):
 def reference():
     """Make the desk of a task that starts at 2000 s."""
     def build(name):
-        desk = Desk(Reference(make_task(name), lambda mass: None), 1999.99)
+        desk = Desk(TaskReference(make_task(name), lambda mass: None), 1999.99)
         proceed(desk)
         assert len(desk.sent) == 1      # 'waiting'
         desk.component.feed('supervisor/state', Mode('flying:nmpc'))
@@ -311,3 +321,46 @@ def test_a_disturbance_beyond_any_controller_is_refused(force, torque, refused):
     assert desk.component.inputs['disturbance'].last_refusal == refused
     assert np.array_equal(desk.component.simulator.wrench,
                           np.zeros(6) if refused else [*force, *torque])
+
+
+# --- components of others ------------------------------------------------------------------------
+
+class Forces(Recorder):
+    """Keeps the observed forces."""
+
+    def __init__(self):
+        super().__init__()
+        self.values = []
+
+    def write(self, topic, value, received=None):
+        if topic == 'observer/force':
+            self.values.append(value.force)
+
+
+def test_an_observer_of_others_estimates_an_external_force_in_the_loop():
+    forces = Forces()
+    loop = FlightLoop(ROBOT, ROBOT, {'hover': HoverController(ROBOT)}, forces,
+                      others=made([OBSERVER], ROBOT))
+    loop.take_off()
+    loop.aim(PoseTarget(np.array([0.0, 0.0, 1.0]), np.array([0, 0, 0, 1.0]), loop.now()))
+    loop.simulator.wrench = np.array([3.0, -2.0, 4.0, 0, 0, 0])
+    loop.run(2.0)
+    assert np.allclose(np.mean(forces.values[-200:], axis=0), [3.0, -2.0, 4.0], atol=0.5)
+
+
+def test_a_class_that_is_no_component_is_refused(tmp_path):
+    file = tmp_path / 'own.py'
+    file.write_text('class Own:\n    pass\n')
+    with pytest.raises(ParameterError, match='no subclass of Component'):
+        component_class(f'{file}:Own')
+    with pytest.raises(ParameterError, match="^component 'gone.py:Own': no such file"):
+        component_class('gone.py:Own')
+    assert node_name(component_class(OBSERVER)) == 'wrench_observer_node'
+
+
+def test_the_graph_runs_it_as_a_node_of_its_own():
+    graph = pytest.importorskip('beetle_omni_ros.ros.graph')
+    nodes, _ = graph.plan('hover', actuators='direct', components=[OBSERVER])
+    assert nodes['wrench_observer_node'] == {'component': OBSERVER}
+    assert graph.plan('hover', bag='b', components=[OBSERVER])[0]['recorder_node'][
+        'components'] == [OBSERVER]

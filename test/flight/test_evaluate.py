@@ -7,6 +7,7 @@ import resource
 import signal
 import subprocess
 import sys
+from textwrap import indent
 
 import numpy as np
 import pytest
@@ -79,62 +80,59 @@ def test_each_controller_has_a_bag_that_gives_the_numbers_of_its_flight(poses, f
     assert again['success_rate'] == results['nmpc']['success_rate'] == 1.0
 
 
-OPEN_LOOP = """
-import numpy as np
-from beetle_omni_ros.control.base import Command
-class Own:
-    period = 0.01
-    def __init__(self, robot): self.thrust = np.full(4, robot.hover_thrust)
-    def reset(self): pass
-    def step(self, state, target): return Command(state.stamp, np.zeros(4),
-        self.thrust * (0.5 + 1e-3 * (state.stamp % 1)))
-"""
+def own(folder, step, name='Own', fields='pass'):
+    """Reference to a class in a file of its own: hover, with ``step`` before each step."""
+    path = folder / f'{name.lower()}.py'
+    path.write_text('import os, signal\n'
+                    'from beetle_omni_ros.control.hover import HoverController\n'
+                    f'class {name}(HoverController):\n    high = None\n    {fields}\n'
+                    f'    def step(self, state, target):\n{indent(step, 8 * " ")}\n'
+                    '        return super().step(state, target)\n')
+    return f'{path}:{name}'
+
+
+def run(result, controllers, task, *more):
+    """Status of the command."""
+    return cli.main(['evaluate', '--controllers', controllers, '--task', str(task), '--json',
+                     str(result), *more])
 
 
 def test_a_crash_ends_the_command_with_status_1_after_the_results(poses, tmp_path):
-    own, result = tmp_path / 'own.py', tmp_path / 'result.json'
-    own.write_text(OPEN_LOOP)
-    assert cli.main(['evaluate', '--controllers', f'{own}:Own', '--task', str(poses), '--json',
-                     str(result)]) == 1
+    falls, result = own(tmp_path, """
+command = super().step(state, target)
+if target.position[2] == 1.1:       # of the task
+    command.thrust[:] = 1.0 + 1e-3 * (state.stamp % 1)
+return command"""), tmp_path / 'result.json'
+    assert run(result, falls, poses) == 1
     assert json.loads(result.read_text())['own']['crashed']
-    assert own_files(f'{own}:Own') == (own,) and own_files('nmpc') == ()
+    assert own_files(falls) == (tmp_path / 'own.py',) and own_files('nmpc') == ()
 
 
 def test_an_exception_in_flight_falls_back_and_is_in_the_results(tmp_path):
-    own, task = tmp_path / 'bad.py', make_task('hover')
-    own.write_text('from beetle_omni_ros.control.hover import HoverController\n'
-                   'class Bad(HoverController):\n'
-                   '    high = None\n'
-                   '    def step(self, state, target):\n'
-                   '        if target.position[2] == 1.0:       # of the task\n'
-                   '            self.high = self.high or state.stamp\n'
-                   '            if 1.0 < state.stamp - self.high < 1.2:\n'
-                   '                return self.absent\n'
-                   '        return super().step(state, target)\n')
+    task = make_task('hover')
     task = replace(task, segments=(replace(task.segments[0], duration=4.0),))
-    results = evaluate(task, [f'{own}:Bad'], bag=tmp_path / 'bag')['bad']
+    bad = own(tmp_path, """if target.position[2] == 1.0:       # of the task
+    self.high = self.high or state.stamp
+    if 1.0 < state.stamp - self.high < 1.2:
+        return self.absent""", 'Bad')
+    results = evaluate(task, [bad], bag=tmp_path / 'bag')['bad']
     states = read_bag(tmp_path / 'bag').states
     at = states.index('fallback:controller_silent')
     assert states[at - 1] == states[at + 1] == 'flying:bad'
     assert 'ended' not in results and not results['crashed']
     assert results['controller_error'].startswith(
         "controller 'bad': step raised AttributeError: 'Bad' object has no attribute 'absent' "
-        '(bad.py:8)')
+        '(bad.py:10)')
 
 
 def test_a_controller_that_fails_all_the_time_fails_the_command(poses, tmp_path, capsys):
-    own, result = tmp_path / 'bad.py', tmp_path / 'result.json'
-    own.write_text('from beetle_omni_ros.control.hover import HoverController\n'
-                   'class Bad(HoverController):\n'
-                   '    def step(self, state, target):\n'
-                   '        if target.position[2] == 1.1:       # of the task\n'
-                   '            raise ValueError("bad")\n'
-                   '        return super().step(state, target)\n')
-    assert cli.main(['evaluate', '--controllers', f'{own}:Bad', '--task', str(poses), '--json',
-                     str(result)]) == 1
+    bad = own(tmp_path, """if target.position[2] == 1.1:       # of the task
+    raise ValueError("bad")""", 'Bad')
+    result = tmp_path / 'result.json'
+    assert run(result, bad, poses) == 1
     assert '0 of 1, 1 in fallback' in capsys.readouterr().out
-    bad = json.loads(result.read_text())['bad']
-    assert bad['success_rate'] == 0 and not bad['crashed'] and bad['controller_error']
+    results = json.loads(result.read_text())['bad']
+    assert results['success_rate'] == 0 and not results['crashed'] and results['controller_error']
 
 
 @pytest.fixture
@@ -146,17 +144,11 @@ def interruptible():
 
 
 def test_ctrl_c_keeps_what_was_flown_and_marks_it(poses, tmp_path, capsys, interruptible):
-    own, result = tmp_path / 'own.py', tmp_path / 'result.json'
-    own.write_text('import os, signal\n'
-                   'from beetle_omni_ros.control.hover import HoverController\n'
-                   'class Own(HoverController):\n'
-                   '    def step(self, state, target):\n'
-                   '        if target.position[2] == 1.1 and state.position[0] > 0.2:\n'
-                   '            target.position[2] = 1.2    # once\n'
-                   '            os.kill(os.getpid(), signal.SIGINT)\n'
-                   '        return super().step(state, target)\n')
-    assert cli.main(['evaluate', '--controllers', f'hover,{own}:Own', '--task', str(poses),
-                     '--json', str(result), '--bag', str(tmp_path / 'bags')]) == 130
+    result = tmp_path / 'result.json'
+    stops = own(tmp_path, """if target.position[2] == 1.1 and state.position[0] > 0.2:
+    target.position[2] = 1.2    # once
+    os.kill(os.getpid(), signal.SIGINT)""")
+    assert run(result, f'hover,{stops}', poses, '--bag', str(tmp_path / 'bags')) == 130
     printed = capsys.readouterr()
     assert f"interrupted; kept {tmp_path / 'bags'}" in printed.out.replace('\n', '')
     assert printed.err == 'beetle_omni: error: interrupted\n'
@@ -171,14 +163,14 @@ def test_ctrl_c_keeps_what_was_flown_and_marks_it(poses, tmp_path, capsys, inter
 
 def test_a_full_disk_is_one_line_and_what_was_written_is_readable(poses, tmp_path):
     done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.cli', 'evaluate', '--controllers', 'hover',
+        [sys.executable, '-m', 'beetle_omni_ros', 'evaluate', '--controllers', 'hover',
          '--task', str(poses), '--bag', str(tmp_path / 'bag')], capture_output=True, text=True,
         check=False, preexec_fn=lambda: resource.setrlimit(
             resource.RLIMIT_FSIZE, (3 * 2**20, 3 * 2**20)))
     line, = done.stderr.splitlines()
     assert done.returncode == 1 and line.startswith(f"beetle_omni: error: {tmp_path / 'bag'}: ")
     log = read_bag(tmp_path / 'bag')
-    assert len(log.truth_t) > 300 and 'cut off' in log.warnings[0]
+    assert len(log.truth.t) > 300 and 'cut off' in log.warnings[0]
 
 
 def test_an_empty_pack_is_swapped_at_the_next_target(monkeypatch):
@@ -190,7 +182,7 @@ def test_an_empty_pack_is_swapped_at_the_next_target(monkeypatch):
     log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)
     assert not log.meta['crashed']
     assert metrics(log, task)['success_rate'] == 1.0
-    drawn = -np.sum(log.battery_current[:-1] * np.diff(log.battery_t)) / 3600
+    drawn = -np.sum(log.battery.current[:-1] * np.diff(log.battery.t)) / 3600
     assert drawn > CAPACITY     # more than one pack holds
 
 
@@ -209,12 +201,9 @@ def test_faults_of_a_file_act_and_are_listed_in_the_results(tmp_path):
 
 
 def test_a_task_beyond_the_declared_reach_of_a_controller_is_refused(tmp_path):
-    far, own = tmp_path / 'far.csv', tmp_path / 'own.py'
+    far, near = tmp_path / 'far.csv', own(tmp_path, 'pass', fields='name, reach = "own", 3.0')
     far.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,0\n4,0,1,0,0,0\n')
-    own.write_text('from beetle_omni_ros.control.hover import HoverController\n'
-                   'class Own(HoverController):\n'
-                   '    name, reach = "own", 3.0\n')
     with pytest.raises(ParameterError, match='row 3: 4 m from the pose before, .* at most 3 m'):
-        evaluate(far, [f'{own}:Own'])
+        evaluate(far, [near])
     with pytest.raises(ParameterError, match='pose 2: 4 m from the pose before, .* at most 3 m'):
-        command.fly(f'{own}:Own', make_task(str(far)), robot=ROBOT, plant=ROBOT)
+        command.fly(near, make_task(str(far)), robot=ROBOT, plant=ROBOT)

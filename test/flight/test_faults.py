@@ -4,38 +4,42 @@ from dataclasses import asdict, replace
 import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.flight import campaign
-from beetle_omni_ros.flight import fault_page as page
 from beetle_omni_ros.flight import faults as command
 from beetle_omni_ros.flight.fault_flights import (
-    fly_trial,
+    FaultFlight,
+    fly_case,
     HEALTHY,
     LANDING,
     LANDING_BLIND,
     PLAN,
-    Trial,
+    Watcher,
 )
-from beetle_omni_ros.sim.fault_lists import load_cases
+from beetle_omni_ros.sim.faults import load_cases
+from beetle_omni_ros.sim.sensors import Impact, Truth
 
+TICK = 0.005
 QUICK = replace(PLAN, hover_time=0.5, watch_time=1.0, jitter=0.2, height=1.1, end_time=0.3,
                 turn_time=0.05, landing_time=10.0, healthy_time=1.0, pose_time=1.0)
 CASES = load_cases() | {case.name: case for case in (HEALTHY, LANDING, LANDING_BLIND)}
 
 
 def flown(case, start='hover', plan=QUICK, bags=None, **options):
-    return fly_trial(Trial(case, start, **options), CASES[case], bags, plan)
+    return fly_case(FaultFlight(case, start, **options), CASES[case], bags, plan)
 
 
 def test_a_trial_is_deterministic_and_its_bag_is_read_back(tmp_path):
     case = 'commands_lost_for_a_moment'
     first, again = flown(case, bags=tmp_path), flown(case)
     assert {**first, 'bag': ''} == again == json.loads(json.dumps(again))
-    assert len(read_bag(tmp_path / first['bag']).truth_t)
+    assert len(read_bag(tmp_path / first['bag']).truth.t)
     assert first['outcome'] == 'flies_on' and first['good'] and not first['error']
     assert 0.1 < first['impact_m_s'] < 1.0
 
@@ -74,12 +78,12 @@ def test_the_ground_is_detected_although_the_accelerometer_jitters_on_it():
 
 
 def result(case, **values):
-    return {**asdict(Trial(case)), 'expected': 'lands', 'outcome': 'lands', 'good': True,
+    return {**asdict(FaultFlight(case)), 'expected': 'lands', 'outcome': 'lands', 'good': True,
             'impact_m_s': 0.3, 'bag': '', 'error': '', **values}
 
 
 def results_of(flights):
-    return {'flights': flights, 'summary': page.summary(flights, CASES), 'meta': {
+    return {'flights': flights, 'summary': command.summary(flights, CASES), 'meta': {
         'command': 'beetle_omni faults', 'date': '2026-11-25', 'version': '0.1.0',
         'commit': 'abcdef0123'}}
 
@@ -92,7 +96,7 @@ def test_summary_counts_add_up():
              *(result('healthy', start='', outcome='flies_on', flown_s=1800.0, good=False,
                       alarms=[[1.0, 'error', 'y']]) for _ in range(2)),
              result('landing_without_mocap', start='', inclination_deg=4.0)]
-    totals = page.summary(flights, CASES)
+    totals = command.summary(flights, CASES)
     assert totals['faults']['gust']['outcomes'] == {'lands': 1, 'flyaway': 1}
     assert totals['faults']['gust']['impact_worst_m_s'] == 0.3
     assert totals['faults']['impact']['named_s'] == 0.2
@@ -108,12 +112,12 @@ def test_the_page_explains_its_outcomes_and_shows_each_flight():
                for start in ('hover', 'moving')]
     flights.append(result('gust', seed=4, outcome='crash, motors on', good=False,
                           impact_m_s=None, error='<b>'))
-    html = page.as_page(results_of(flights), Path('runs_out/faults'))
+    html = command.as_page(results_of(flights), Path('runs_out/faults'))
     for text in ('commit abcdef0123', '2 of 3 as expected', 'below 1 m/s and 30 deg', '&lt;b&gt;',
                  'bag_of_moving',
                  'beetle_omni report runs_out/faults/bags/BAG'):
         assert text in html, text
-    assert all(f'<li>{name}: ' in html for name in page.OUTCOMES) and 'http' not in html
+    assert all(f'<li>{name}: ' in html for name in command.OUTCOMES) and 'http' not in html
 
 
 def test_the_command_writes_its_files_and_a_campaign_continues(tmp_path, monkeypatch):
@@ -143,3 +147,73 @@ def test_the_command_writes_its_files_and_a_campaign_continues(tmp_path, monkeyp
     assert json.loads((tmp_path / 'faults.json').read_text())['summary']['total']['good'] == 2
     assert '| gust |' in (tmp_path / 'faults.md').read_text()
     assert f"page: {tmp_path / 'faults.html'}\n" in console.file.getvalue()
+
+
+# --- outcome of a flight from the truth ----------------------------------------------------------
+
+def truth(t, height=1.0, x=0.0, contact=False, impact=None, broken=False):
+    return Truth(t, np.array([x, 0.0, height]), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3),
+                 np.zeros(4), np.zeros(4), np.zeros(4), contact, impact, broken)
+
+
+@pytest.fixture
+def watch():
+    return Watcher(SimpleNamespace(
+        simulator=SimpleNamespace(truth=truth(0.0, 0.0), time=0.0), refusals=[], events=[],
+        supervisor=SimpleNamespace(faults={}, state='disarmed')), PLAN)
+
+
+def soft(t=1.0, speed=0.3, inclination=0.05):
+    return Impact(t, speed, inclination)
+
+
+def judged(watch, asked=True, state='disarmed', refusals=()):
+    watch._loop.supervisor.state, watch._loop.refusals = state, refusals
+    return watch.outcome(asked)
+
+
+def test_a_soft_landing_counts_as_flies_on_lands_or_refused(watch):
+    watch.step(truth(1.0, 0.15, contact=True, impact=soft()), 0.0, TICK)
+    assert judged(watch) == 'flies_on'
+    assert judged(watch, asked=False) == 'lands'
+    assert judged(watch, refusals=['far']) == 'refused'
+    assert judged(watch, state='flying') == 'does not land'
+
+
+def test_a_hard_or_tilted_touchdown_is_not_a_landing(watch):
+    watch.step(truth(1.0, impact=soft(inclination=1.1 * PLAN.inclination)), 0.0, TICK)
+    assert judged(watch) == 'tilted'
+    watch.step(truth(2.0, impact=soft(2.0, speed=1.1 * PLAN.impact_speed)), 0.0, TICK)
+    assert judged(watch) == 'hard'
+
+
+@pytest.mark.parametrize(('late', 'outcome'), [(0.2, 'stops'), (0.5, 'crash, motors on')])
+def test_motors_must_stop_soon_after_a_crash(watch, late, outcome):
+    for k in range(300):
+        t = k * TICK
+        watch.step(truth(t, 0.1, contact=True, impact=soft(0.1, 3.0), broken=t >= 0.1),
+                   20.0 if t <= 0.1 + late else 0.0, TICK)
+    assert judged(watch) == outcome
+    assert np.isclose(watch.overrun, late, atol=2 * TICK)
+    assert judged(watch, state='flying') == 'crash, motors on'
+
+
+def test_a_flyaway_is_a_position_far_outside(watch):
+    fence = watch._fence[0] + PLAN.fence_margin
+    watch.step(truth(1.0, x=fence - 0.1), 20.0, TICK)
+    assert judged(watch) != 'flyaway'
+    watch.step(truth(1.0, x=fence + 0.1), 20.0, TICK)
+    assert judged(watch) == 'flyaway'
+
+
+def test_rising_after_rest_is_a_takeoff_and_bouncing_is_not(watch):
+    for k in range(200):
+        watch.step(truth(k * TICK, 0.15, contact=k % 40 > 0), 0.0, TICK)
+    watch.step(truth(1.1, 1.0), 20.0, TICK)
+    assert watch.takeoffs == 0
+    for k in range(200):
+        watch.step(truth(2 + k * TICK, 0.15, contact=True), 0.0, TICK)
+    for height in (0.3, 0.7, 1.0):
+        watch.step(truth(4.0, height), 20.0, TICK)
+    assert watch.takeoffs == 1
+    assert judged(watch) == 'takes off'

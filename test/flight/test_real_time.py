@@ -26,9 +26,7 @@ def test_a_flight_through_drivers_and_emulated_devices_holds_its_target():
     with closing(EmulatedLoop(ROBOT, ROBOT, {'hover': HoverController(ROBOT)}, recorder)) as loop:
         loop.take_off()
         loop.aim(PoseTarget(np.array([0.0, 0.0, 1.0]), np.array([0, 0, 0, 1.0]), loop.now()))
-        end = loop.simulator.time + 2.0
-        while loop.simulator.time < end:
-            loop.step()
+        loop.run(2.0)
         truth = loop.simulator.truth
         # a stall of the computer leads to the fallback, which is the same controller
         assert loop.supervisor.state in ('flying', 'fallback')
@@ -36,9 +34,9 @@ def test_a_flight_through_drivers_and_emulated_devices_holds_its_target():
     assert np.linalg.norm(truth.position - [0, 0, 1.0]) < 0.1
     log = recorder.log()
     # Angles in counts of the encoder: they passed the registers of the servos.
-    counts = log.joint_position[-200:] / (2 * np.pi / 4096)
-    assert np.allclose(counts, np.round(counts), atol=1e-6) and len(log.joint_t) > 400
-    assert len(log.battery_t) > 4
+    counts = log.joint.position[-200:] / (2 * np.pi / 4096)
+    assert np.allclose(counts, np.round(counts), atol=1e-6) and len(log.joint.t) > 400
+    assert len(log.battery.t) > 4
 
 
 def test_faults_of_devices_need_direct_actuators():

@@ -1,6 +1,5 @@
 """Flights of a comparison: plan, both backends, stored results, failures."""
 
-import importlib.util
 import io
 import json
 
@@ -9,12 +8,8 @@ from rich.console import Console
 
 from beetle_omni_ros.flight import campaign
 from beetle_omni_ros.flight import compare as command
-from beetle_omni_ros.flight import compared_flights as flights_module
 from beetle_omni_ros.flight.campaign import Store
-from beetle_omni_ros.flight.compared_flights import Flight, fly_flight, plan
-from beetle_omni_ros.model.schema import RunError
-
-HAS_RAY = importlib.util.find_spec('ray') is not None
+from beetle_omni_ros.flight.compare import ComparedFlight, fly_flight, plan
 
 
 @pytest.fixture
@@ -53,29 +48,17 @@ def test_workers_give_the_numbers_of_this_process_and_are_flown_once(poses, tmp_
     with pytest.raises(KeyboardInterrupt):
         sweep(flights, store=store, jobs=1, line=interrupt)
     assert lines == [(3, True), (4, False)]
-    monkeypatch.setattr(flights_module, 'fly', None)    # all are kept
+    monkeypatch.setattr(command, 'fly', None)    # all are kept
     both = sweep(flights, store=store, jobs=1)
     assert without_times(first[0]) == without_times(both[0])
     assert both[1]['metrics']['poses'] and not both[1]['failure']
 
 
-@pytest.mark.skipif(not HAS_RAY, reason='ray is not installed')
-@pytest.mark.timeout(180)
-def test_ray_gives_the_same_numbers_as_processes(poses):
-    flights = plan(['hover'], [poses], ['nominal'], [0, 1])
-    by_ray, by_processes = (sweep(flights, backend=backend, jobs=2)
-                            for backend in ('ray', 'processes'))
-    assert [one['failure'] for one in by_ray] == [None, None]
-    assert list(map(without_times, by_ray)) == list(map(without_times, by_processes))
-    import ray
-    assert not ray.is_initialized()
-
-
 def test_a_stored_flight_is_reused_for_equal_inputs_only(poses, tmp_path, monkeypatch):
-    store, flight = Store(tmp_path / 'kept'), Flight(poses, 'nominal', 'hover', 0)
+    store, flight = Store(tmp_path / 'kept'), ComparedFlight(poses, 'nominal', 'hover', 0)
     store.save(flight, {'failure': None, 'metrics': {'a': list(range(999))}, 'trace': {}})
     assert store.load(flight) is not None
-    assert store.load(Flight(poses, 'nominal', 'hover', 1)) is None
+    assert store.load(ComparedFlight(poses, 'nominal', 'hover', 1)) is None
     with monkeypatch.context() as patch:
         patch.setattr(campaign, 'code_fingerprint', lambda *_: 'other code')
         assert store.load(flight) is None
@@ -94,8 +77,8 @@ def test_a_failed_flight_is_a_result_with_its_reason_and_not_stored(poses, tmp_p
             raise ZeroDivisionError('no way\nout')
         return real(controller, *arguments, **options)
 
-    real = flights_module.fly
-    monkeypatch.setattr(flights_module, 'fly', fly)
+    real = command.fly
+    monkeypatch.setattr(command, 'fly', fly)
     results = command.run_compare(
         output=tmp_path / 'out', controllers=['nmpc', 'hover'], tasks=[poses],
         conditions=['nominal'], seeds=[0], jobs=1, console=Console(file=io.StringIO()))
@@ -104,8 +87,3 @@ def test_a_failed_flight_is_a_result_with_its_reason_and_not_stored(poses, tmp_p
     assert flown['failure'] is None and flown['metrics']['poses']
     assert 'ZeroDivisionError: no way out' in (tmp_path / 'out' / 'comparison.html').read_text()
     assert len(list((tmp_path / 'out' / '.flights').glob('*.npz'))) == 1
-
-
-def test_a_worker_with_different_code_is_refused():
-    with pytest.raises(RunError, match='another version of the code'):
-        campaign._fly_one(0, 'another', fly_flight, ())

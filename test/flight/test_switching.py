@@ -8,7 +8,7 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.loop import FlightLoop
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.supervisor.supervisor import HANDOVER_TIME, THRUST_RATE, TILT_RATE
+from beetle_omni_ros.supervisor.commands import HANDOVER_TIME, THRUST_RATE, TILT_RATE
 
 ROBOT = RobotParameters.load()
 POSES, SWITCHES = 2, 20
@@ -49,16 +49,16 @@ def test_twenty_switches_at_random_times_of_random_poses():
         state.partition(':')[0] for state in log.states}
     assert all(pose['reached'] for pose in metrics(log, task)['poses'])
     for moment, _ in recorder.switched:     # without a jump of the command
-        k = np.searchsorted(log.command_t[1:], moment - 1e-9)
-        step = log.command_t[k + 1] - log.command_t[k]
-        for values, rate in ((log.command_tilt, TILT_RATE), (log.command_thrust, THRUST_RATE)):
+        k = np.searchsorted(log.command.t[1:], moment - 1e-9)
+        step = log.command.t[k + 1] - log.command.t[k]
+        for values, rate in ((log.command.tilt, TILT_RATE), (log.command.thrust, THRUST_RATE)):
             assert np.abs(values[k + 1] - values[k]).max() <= rate * step + 1e-6
     # After the handover the executed command is that of the selected controller. The time of a
     # handover is measured in stamps and ends with the first command beyond it.
     settled = HANDOVER_TIME + 2 * PERIOD
     for (start, name), (end, _) in zip(flown, [*flown[1:], (log.end, '')]):
         asked = log.requests[name.partition(':')[2]]
-        inside = (log.command_received > start + settled) & (log.command_received < end)
-        k = np.searchsorted(asked.t, log.command_t[inside])
-        assert np.allclose(asked.t[k], log.command_t[inside])
-        assert np.allclose(asked.tilt[k], log.command_tilt[inside], atol=1e-9)
+        inside = (log.command.received > start + settled) & (log.command.received < end)
+        k = np.searchsorted(asked.t, log.command.t[inside])
+        assert np.allclose(asked.t[k], log.command.t[inside])
+        assert np.allclose(asked.tilt[k], log.command.tilt[inside], atol=1e-9)

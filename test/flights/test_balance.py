@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 from test_engine import BESIDE, gap_of, motor_volts, ROBOT
 
 from beetle_omni_ros.identify.flights.balance import Balance, SCALES, SCATTER, SESSION, SLOW
-from beetle_omni_ros.identify.flights.priors import keys_of, spread
+from beetle_omni_ros.identify.flights.keys import keys_of, prior_of
 from beetle_omni_ros.model.parameters import RobotParameters
 
 HEADER = ('t,ekf_px,ekf_py,ekf_pz,ekf_vx,ekf_vy,ekf_vz,ekf_ax,ekf_ay,ekf_az,ekf_roll,ekf_yaw,'
@@ -65,8 +65,8 @@ def test_evidence_and_estimate_agree_with_dense_densities():
     found = Balance(parts, robot)
     a = np.concatenate([slopes.reshape(10, -1) for _, slopes in parts])
     y = np.concatenate([part.ravel() for part, _ in parts])
-    spreads = [spread(robot, key, 0.0, 0.0) for key in keys.values()]
-    narrow, typical, flight = np.array([[s.narrow, s.typical, s.flight] for s in spreads]).T
+    priors = [prior_of(robot, key, 0.0, 0.0) for key in keys.values()]
+    narrow, typical, flight = np.array([[s.narrow, s.typical, s.flight] for s in priors]).T
     hub = found.index['rotor_hub_moment.coefficient']
     narrow[hub] += 9 * typical[hub]
     same = np.kron(np.eye(2), np.ones((10, 10)))

@@ -9,12 +9,13 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
+from beetle_omni_ros.identify.flights.command import gap_results
 from beetle_omni_ros.identify.flights.evidence import Judge, normal
-from beetle_omni_ros.identify.flights.motion import turning, wander
 from beetle_omni_ros.identify.flights.spectrum import EDGES, spectrum
-from beetle_omni_ros.identify.flights.table import Format, read_flight
-from beetle_omni_ros.identify.flights.table_verdict import load_tables
-from beetle_omni_ros.identify.gap.command import gap_results
+from beetle_omni_ros.identify.flights.table_flight import wander
+from beetle_omni_ros.identify.flights.verdict import load_tables
+from beetle_omni_ros.identify.recording.series import turning
+from beetle_omni_ros.identify.recording.table import Format, read_flight
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import ParameterError

@@ -5,7 +5,7 @@ import gzip
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.flights.table import Format, read_flight
+from beetle_omni_ros.identify.recording.table import Format, read_flight
 from beetle_omni_ros.model.schema import ParameterError
 
 FORMAT = """

@@ -1,8 +1,7 @@
 """Verdicts as sentences, tables and a page."""
 
-from beetle_omni_ros.identify.flights.page import gap_page
+from beetle_omni_ros.identify.flights.page import gap_page, grids, headline
 from beetle_omni_ros.identify.flights.results import result_of
-from beetle_omni_ros.identify.flights.text import grids, headline
 
 SIZE = {'value': 0.4, 'interval': [0.36, 0.44], 'unit': 'N s/m', 'file': 0.0, 'typical': 0.4}
 DRAG = {'names': ['rotor_drag'], 'parameters': {'coefficient': SIZE},

@@ -7,8 +7,8 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from beetle_omni_ros.identify.flights.quality import line, repeatable
 from beetle_omni_ros.identify.flights.spectrum import spectrum
-from beetle_omni_ros.identify.flights.unexplained import line, repeatable
 from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()

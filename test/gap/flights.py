@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.identify.flights.bag import BagFlight
-from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.ingest import Flight
-from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
-from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.flights.bag_flight import BagFlight, PLACE
+from beetle_omni_ros.identify.flights.body import BodyModel
+from beetle_omni_ros.identify.flights.keys import all_keys, extra_keys
+from beetle_omni_ros.identify.recording.bag import BATTERY, COMMAND, IMU, JOINTS, POSE, Recording
+from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = replace(RobotParameters.load(), multibody=None)
@@ -17,7 +17,6 @@ P = GapParameters.load()
 KEYS = {**all_keys(ROBOT), **extra_keys()}
 BODY = BodyModel(ROBOT, KEYS, (0.0, 0.0))
 STEP = 0.005
-PLACE = {'B': slice(0, 6), 'A': slice(6, 9), 'W': slice(9, 12), 'J': slice(12, 16)}
 
 
 def waves(t, seed, width, size, highest=0.5):
@@ -85,11 +84,12 @@ class Motion:
         pose[1:, 3:] *= np.cumprod(sign)[:, None]
         shift = P.command_delay + STEP / 2       # held: half a step late on average
         # Commands have the times at which they must be sent to act at t.
-        return Flight('made', 0.0, self.t[-1], self.t + imu_delay,
-                      imu, self.t[::2] + pose_delay, pose, self.t + joint_delay, self.tilt,
-                      self.t - shift,
-                      np.concatenate([self.tilt_command, thrust], axis=1), self.t,
-                      np.column_stack([self.voltage, self.charge]))
+        return Recording('made', {
+            IMU: self.t + imu_delay, POSE: self.t[::2] + pose_delay, JOINTS: self.t + joint_delay,
+            COMMAND: self.t - shift, BATTERY: self.t}, {
+            IMU: imu, POSE: pose, JOINTS: self.tilt,
+            COMMAND: np.concatenate([self.tilt_command, thrust], axis=1),
+            BATTERY: np.column_stack([self.voltage, self.charge])}, duration=self.t[-1])
 
 
 def model(flight, robot=ROBOT, body=BODY, keys=KEYS):

@@ -7,16 +7,15 @@ from flights import KEYS, model, Motion, P, ROBOT, solved, STEP
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.residual import limit_starts
-from beetle_omni_ros.identify.gap.servo import (
+from beetle_omni_ros.identify.flights.bag_flight import starts_of
+from beetle_omni_ros.identify.flights.servo import (
     module_load,
     simulate,
-    spin_load,
     undescribed_load,
     Windows,
 )
-from beetle_omni_ros.identify.gap.signals import Signals
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.identify.flights.signals import Signals
+from beetle_omni_ros.identify.recording.bag import COMMAND, JOINTS
 from beetle_omni_ros.model.parameters import RobotParameters
 
 MOTION = Motion(9, 12.0)
@@ -33,9 +32,15 @@ def steps(t):
 
 def flight(angles):
     """Readings of such joints; commands have the stamps of sending."""
+    made = commanded(MOTION.flight().values[COMMAND][:, 4:])
+    return replace(made, values=made.values | {JOINTS: angles})
+
+
+def commanded(thrust):
+    """Readings with these thrusts (N, 4) [N] and steps of the joints as commands."""
     made = MOTION.flight()
-    command = np.concatenate([steps(MOTION.t), made.command[:, 4:]], axis=1)
-    return replace(made, joint=angles, command_t=MOTION.t, command=command)
+    return replace(made, times=made.times | {COMMAND: MOTION.t}, values=made.values | {
+        COMMAND: np.concatenate([steps(MOTION.t), thrust], axis=1)})
 
 
 CASES = [
@@ -126,8 +131,7 @@ def lagged(tau, delay, most=99.0, k_asked=None):
      np.log(9.5 / 20))])
 def test_a_rotor_effect_is_recovered_from_the_thrust_that_results(true, name, value, start):
     asked = MOTION.thrust + 1.5 * np.sign(np.sin(5 * MOTION.t))[:, None]
-    made = model(replace(MOTION.flight(), command_t=MOTION.t, command=np.concatenate(
-        [steps(MOTION.t), asked], axis=1)))
+    made = model(commanded(asked))
     truth = lagged(k_asked=asked, **true)
     rows = np.rint(made.signals.t / STEP).astype(int)
     x = start
@@ -146,20 +150,9 @@ def test_play_behind_the_encoder_turns_the_true_tilt_only():
     assert 0.008 < apart.max() < 0.011
 
 
-def test_the_gyroscopic_load_on_a_joint_agrees_with_euler():
-    """Turning the angular momentum needs a torque, which the servo gives about its axis."""
-    made = model(MOTION.flight())
-    load, t = spin_load(made.signals, {}), made.signals.t
-    speed = np.sqrt(MOTION.thrust / (ROBOT.mass * ROBOT.gravity / 4))
-    for i, axis in enumerate(ROBOT.tilt_axes):
-        momentum = ROBOT.rotors.spin[i] * speed[:, i:i + 1] * MOTION.normals[:, i]
-        expected = -np.cross(MOTION.rate, momentum) @ axis
-        assert np.allclose(load[:, i], np.interp(t, MOTION.t, expected), atol=5e-3)
-
-
 def test_a_torque_limit_is_recovered_from_samples_at_the_limit():
     made, key = model(flight(servo(effort=0.05))), 'joint_torque_limit.effort_limit'
-    begin = limit_starts(KEYS[key], CATALOGUE['joint_torque_limit'], [made])
+    begin = starts_of(KEYS[key], [made])
     tried = [start[0] for start in begin]
     rest = [np.square(made.residual(theta, 'J')['J']).mean()
             for theta in ({}, *({key: x} for x in tried))]
@@ -190,7 +183,7 @@ def test_undescribed_modules_load_joints_as_described_ones_of_equal_moment_and_i
 def test_a_servo_sags_under_a_module_that_hangs_beside_its_axis(sets, base, moment):
     k, gravity = 800, 9.8
     zero, one = np.zeros((k, 1, 4)), np.ones((k, 1, 4))
-    windows = Windows(zero[0], zero[0], zero, zero, zero, P.servo_step, 0, 8,
+    windows = Windows(zero[0], zero[0], zero, zero, P.servo_step, 0, 8,
                       (gravity * one, zero))
     robot = replace(ROBOT, effects={'module_reaction': {'module_inertia': 0.0,
                                                         'mass_moment': base}})

@@ -13,16 +13,15 @@ from test_consumers import OUTPUTS, plain, with_effect
 from test_ingest import recording
 
 import beetle_omni_ros
-from beetle_omni_ros.identify.flights.priors import entries_of
-from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.command import gap_results
-from beetle_omni_ros.identify.gap.ingest import prepare
-from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
-from beetle_omni_ros.model import catalogue
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.identify.flights.body import BodyModel
+from beetle_omni_ros.identify.flights.command import gap_results
+from beetle_omni_ros.identify.flights.keys import all_keys, entries_of, extra_keys
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
+from beetle_omni_ros.identify.recording.flight import prepare
+from beetle_omni_ros.model.effects import CATALOGUE, ignored
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs/how-to/add_an_effect.md'
-ENTRY, MEASURED, TEST = re.findall(r'```python\n(.*?)```', PAGE.read_text(), flags=re.S)
+ENTRY, TREATMENT, MEASURED, TEST = re.findall(r'```python\n(.*?)```', PAGE.read_text(), flags=re.S)
 HEAT, FADE = 'motor_heat', 'charge_fade'    # the second of a measured quantity
 
 
@@ -30,10 +29,12 @@ HEAT, FADE = 'motor_heat', 'charge_fade'    # the second of a measured quantity
 def added(monkeypatch):
     """The catalogue with the page's entries."""
     made = {}
-    for text in (ENTRY, MEASURED):
+    for text in (ENTRY, TREATMENT, MEASURED):
         exec(compile(text, str(PAGE), 'exec'), made)
         for name, entry in made['CATALOGUE'].items():
             monkeypatch.setitem(CATALOGUE, name, entry)
+        for name, entry in made.get('TREATMENTS', {}).items():
+            monkeypatch.setitem(TREATMENTS, name, entry)
 
 
 def test_the_test_of_the_page_passes_only_with_the_new_entry(monkeypatch):
@@ -49,7 +50,7 @@ def test_the_test_of_the_page_passes_only_with_the_new_entry(monkeypatch):
 @pytest.mark.parametrize('consumer', ['nmpc', 'training', 'plant'])
 @pytest.mark.parametrize('name', [HEAT, FADE])
 def test_a_consumer_applies_the_added_effect_or_has_no_such_quantity(name, consumer):
-    reason = catalogue.ignored(consumer, name)
+    reason = ignored(consumer, name)
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](with_effect(name))])
     assert (not reason) == (name == HEAT or consumer == 'plant')
     assert np.array_equal(found, plain(consumer)) == bool(reason)
@@ -91,5 +92,5 @@ def test_the_charge_is_the_integral_of_the_current_since_the_first_message(curre
         values[10:20, 1] = np.nan
     flight = prepare(made, ROBOT, P)
     assert not flight.findings
-    expected = np.interp(flight.start + flight.battery_t, motion.t, motion.charge)
-    np.testing.assert_allclose(flight.battery[:, 1], expected, atol=1e-6)
+    expected = np.interp(flight.start + flight.times['battery_state'], motion.t, motion.charge)
+    np.testing.assert_allclose(flight.values['battery_state'][:, 1], expected, atol=1e-6)

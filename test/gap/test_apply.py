@@ -8,11 +8,10 @@ from flights import ROBOT as PLAIN
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.flights.priors import entries_of, Entry
+from beetle_omni_ros.identify.flights.apply import write_corrected
+from beetle_omni_ros.identify.flights.keys import entries_of, Entry
 from beetle_omni_ros.identify.flights.results import FORM_DEVIATION, parameters
-from beetle_omni_ros.identify.gap.apply import write_corrected
-from beetle_omni_ros.model.catalogue import ignored
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE, ignored
 from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()

@@ -1,5 +1,8 @@
 """Every name that programs rely on is in the catalogue, with a complete description."""
 
+import pytest
+
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.model.effects import CATALOGUE
 
 # layer -> names of its effects, with those of their parameters that are fixed
@@ -29,3 +32,15 @@ def test_fixed_names_exist_in_their_layer_with_their_parameters():
             name, _, parameter = entry.partition('.')
             assert CATALOGUE[name].layer == layer, name
             assert not parameter or parameter in CATALOGUE[name].parameters, entry
+
+
+@pytest.mark.parametrize('name', CATALOGUE)
+def test_a_fit_has_a_complete_and_consistent_treatment_of_each_effect(name):
+    treatment = TREATMENTS[name]
+    assert list(treatment.sizes) == CATALOGUE[name].numbers
+    assert treatment.excited_by and treatment.separated_by
+    assert all(other in CATALOGUE for other in treatment.confused_with)
+    assert set(treatment.channels) <= set('BAWJ') and treatment.channels
+    assert all(len(start) == len(treatment.sizes) for start in treatment.starts)
+    assert all(size.step > 0 and size.typical > size.smallest > 0
+               for size in treatment.sizes.values())

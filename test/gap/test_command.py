@@ -18,7 +18,7 @@ import beetle_omni_ros
 from beetle_omni_ros import cli
 from beetle_omni_ros.bags.bag import read_messages
 from beetle_omni_ros.bags.bag_writer import BagWriter
-from beetle_omni_ros.identify.gap.command import gap_results, run_gap
+from beetle_omni_ros.identify.flights.command import gap_results, run_gap
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 

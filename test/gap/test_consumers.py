@@ -12,10 +12,11 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc import NmpcParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.identify.gap.keys import number_of
-from beetle_omni_ros.model import catalogue, dynamics
+from beetle_omni_ros.identify.flights.keys import number_of
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
+from beetle_omni_ros.model import dynamics
 from beetle_omni_ros.model.allocation import Allocator
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE, ignored
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.sim.parameters import draw, SimulatorParameters
 from beetle_omni_ros.sim.simulator import CommandLink, Simulator
@@ -27,12 +28,13 @@ def with_effect(name):
     """The robot with an effect of typical size; values of the file decrease by it."""
     values = {}
     for parameter, spec in CATALOGUE[name].parameters.items():
-        if spec.form:
+        size = TREATMENTS[name].sizes.get(parameter)
+        if size is None:
             values[parameter] = spec.neutral
         elif spec.number:
-            values[parameter] = (1 - spec.typical) * number_of(ROBOT, spec.number)
+            values[parameter] = (1 - size.typical) * number_of(ROBOT, spec.number)
         else:
-            values[parameter] = np.array(spec.neutral) + spec.typical
+            values[parameter] = np.array(spec.neutral) + size.typical
     return replace(ROBOT, effects={name: {
         key: tuple(value.tolist()) if np.ndim(value) else float(value)
         for key, value in values.items()}})
@@ -135,7 +137,7 @@ def flight_model():
 def gap(name):
     """Whether a key of the effect changes the residual."""
     made = flight_model()
-    limit = CATALOGUE[name].limit     # beyond this calm flight
+    limit = TREATMENTS[name].limit     # beyond this calm flight
     theta = {key.name: np.log(1e-5 if limit else 1 - key.typical) if key.relative
              else key.typical for key in KEYS.values() if key.effect == name and not key.form}
     before, after = made.residual({}), made.residual(theta)
@@ -154,7 +156,7 @@ def plain(consumer):
 @pytest.mark.parametrize('name', CATALOGUE)
 @pytest.mark.parametrize('consumer', OUTPUTS)
 def test_a_consumer_applies_an_effect_or_states_why_not(consumer, name):
-    reason, robot = catalogue.ignored(consumer, name), with_effect(name)
+    reason, robot = ignored(consumer, name), with_effect(name)
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](robot)])
     changed = found.shape != plain(consumer).shape or not np.array_equal(found, plain(consumer))
     assert changed != bool(reason), reason or f'{name} changes nothing'
@@ -162,4 +164,4 @@ def test_a_consumer_applies_an_effect_or_states_why_not(consumer, name):
 
 @pytest.mark.parametrize('name', CATALOGUE)
 def test_the_gap_finder_applies_every_effect(name):
-    assert gap(name) != bool(catalogue.ignored('gap', name))
+    assert gap(name) != bool(ignored('gap', name))

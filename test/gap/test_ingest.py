@@ -6,21 +6,16 @@ from flights import model, Motion, P, ROBOT
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.bags import Recording
-from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
-from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.recording.bag import BATTERY, COMMAND, IMU, Recording
+from beetle_omni_ros.identify.recording.flight import prepare, UnusableFlight
+from beetle_omni_ros.identify.recording.parameters import GapParameters
 
 
 def recording(duration=16.0):
     motion = Motion(duration=duration)
     flight = motion.flight()
-    return Recording('case', {
-        'imu/data_raw': flight.imu_t, 'mocap/pose': flight.pose_t,
-        'joint_states': flight.joint_t, 'command': flight.command_t + 0.02,
-        'battery_state': flight.battery_t}, {
-        'imu/data_raw': flight.imu, 'mocap/pose': flight.pose, 'joint_states': flight.joint,
-        'command': flight.command, 'battery_state': np.column_stack([
-            motion.voltage, motion.current])})
+    return Recording('case', flight.times | {COMMAND: flight.times[COMMAND] + 0.02},
+                     flight.values | {BATTERY: np.column_stack([motion.voltage, motion.current])})
 
 
 def refused(made, *words):
@@ -83,4 +78,4 @@ def test_nan_readings_are_omitted_and_counted():
     made.values['imu/data_raw'][100:104] = np.nan
     flight = prepare(made, ROBOT, P)
     assert any('4 messages' in text for text in flight.findings)
-    assert np.isfinite(flight.imu).all()
+    assert np.isfinite(flight.values[IMU]).all()

@@ -13,13 +13,18 @@ from scipy.signal import step as step_response
 from scipy.spatial.transform import Rotation, Slerp
 import yaml
 
-from beetle_omni_ros.identify.gap.bags import read_recording
-from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
-from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.recording.bag import (
+    changed,
+    COMMAND,
+    IMU,
+    JOINTS,
+    POSE,
+    read_recording,
+)
 from beetle_omni_ros.identify.recording.check import checked
-from beetle_omni_ros.identify.recording.damage import changed
-from beetle_omni_ros.identify.recording.limits import RecordingLimits
-from beetle_omni_ros.identify.recording.readings import sensor_damages
+from beetle_omni_ros.identify.recording.flight import prepare, UnusableFlight
+from beetle_omni_ros.identify.recording.parameters import GapParameters, RecordingLimits
+from beetle_omni_ros.identify.recording.topics import sensor_damages
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import share_path
 
@@ -62,7 +67,6 @@ def turned_pose(made, world=None, body=None):
 
 
 P = GapParameters.load()
-IMU, POSE, JOINTS, COMMAND = 'imu/data_raw', 'mocap/pose', 'joint_states', 'command'
 HALF = 12.2
 
 
@@ -265,7 +269,8 @@ def test_what_is_harmless_is_used_and_stated(change, words):
     sound, made = prepare(recording(), ROBOT, P), prepare(change(recording()), ROBOT, P)
     assert not words and not made.findings or any(words in text for text in made.findings)
     assert made.duration == pytest.approx(sound.duration, abs=0.05)
-    assert np.allclose(sound.imu[:999], made.imu[-len(sound.imu):][:999]) or not made.findings
+    before, after = sound.values[IMU], made.values[IMU]
+    assert np.allclose(before[:999], after[-len(before):][:999]) or not made.findings
 
 
 def rested(before, after):

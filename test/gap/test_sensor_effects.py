@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, names_of
-from beetle_omni_ros.model.catalogue import ignored
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.identify.flights.keys import all_keys, extra_keys, names_of
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
+from beetle_omni_ros.identify.recording.bag import changed, JOINTS
+from beetle_omni_ros.model.effects import CATALOGUE, ignored
 
 MOTION = Motion(5)
 NEUTRAL = dict(model(MOTION.flight()).residual({}).items())
@@ -75,16 +76,16 @@ def test_a_lever_arm_is_the_position_of_the_imu():
                                   and not ignored('gap', name)])
 def test_a_fit_begins_at_the_sensor_effects_of_the_robot_file(name):
     parameter, = CATALOGUE[name].numbers
-    spec = CATALOGUE[name].parameters[parameter]
-    known = replace(ROBOT, effects={name: {parameter: (np.array(spec.neutral)
-                                                       + spec.typical).tolist()}})
+    neutral = CATALOGUE[name].parameters[parameter].neutral
+    typical = TREATMENTS[name].sizes[parameter].typical
+    known = replace(ROBOT, effects={name: {parameter: (np.array(neutral) + typical).tolist()}})
     keys = {**all_keys(known), **extra_keys()}
     given = model(MOTION.flight(), known, BODY, keys).residual({})
-    theta = dict.fromkeys(names_of(name, parameter), spec.typical)
+    theta = dict.fromkeys(names_of(name, parameter), typical)
     fitted = model(MOTION.flight()).residual(theta)
     for group in given:
         assert given[group] == pytest.approx(fitted[group], abs=1e-9)
-    assert keys[names_of(name, parameter)[0]].value(0.0) == pytest.approx(spec.typical)
+    assert keys[names_of(name, parameter)[0]].value(0.0) == pytest.approx(typical)
 
 
 DELAY = 'joint_feedback_delay.delay'
@@ -93,7 +94,8 @@ DELAY = 'joint_feedback_delay.delay'
 def noisy(tilt=0.0, **late):
     """A flight with noise of the encoders as large as in the publication or larger [rad]."""
     rng, flight = np.random.default_rng(3), MOTION.flight(**late)
-    return replace(flight, joint=flight.joint + tilt * rng.standard_normal(flight.joint.shape))
+    joint = flight.values[JOINTS]
+    return changed(flight, JOINTS, values=joint + tilt * rng.standard_normal(joint.shape))
 
 
 def at(made, series):
@@ -122,7 +124,7 @@ def test_tilts_follow_the_servo_model_if_encoders_are_noisy():
     inside = slice(100, -150)
     truth = at(made, MOTION.tilt), at(made, MOTION.tilt_acceleration)
     before = [made.signals.joints({})[k] - truth[j] for j, k in enumerate((0, 2))]
-    made.smooth_tilts({})
+    made.settle({})
     after = [made.signals.joints({})[k] - truth[j] for j, k in enumerate((0, 2))]
     assert rms(after[0][inside]) < 0.35 * rms(before[0][inside])
     assert rms(after[1][inside]) < 0.05 * rms(before[1][inside])

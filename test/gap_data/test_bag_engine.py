@@ -7,12 +7,13 @@ from gap_data.make import make_case
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.flights.bag import BagFlight
-from beetle_omni_ros.identify.flights.bag_verdict import judged
-from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.ingest import load_flight
-from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
-from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.flights.bag_flight import BagFlight
+from beetle_omni_ros.identify.flights.body import BodyModel
+from beetle_omni_ros.identify.flights.keys import all_keys, extra_keys
+from beetle_omni_ros.identify.flights.verdict import judged
+from beetle_omni_ros.identify.recording.bag import read_recording
+from beetle_omni_ros.identify.recording.flight import prepare
+from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.model.parameters import RobotParameters
 
 P, ROBOT = GapParameters.load(), RobotParameters.load()
@@ -22,7 +23,8 @@ def flights(folder, seed, *effects, duration=40.0, **more):
     case = Case('singles' if effects else 'none', 'hard', seed, effects, duration=duration,
                 gust=True, multibody=True, tolerance=True, **more)
     made = make_case(case, folder / 'flights', folder / 'sealed')
-    return [load_flight(made / name, ROBOT, P) for name in ('fit_1', 'fit_2', 'holdout_1')]
+    return [prepare(read_recording(made / name), ROBOT, P)
+            for name in ('fit_1', 'fit_2', 'holdout_1')]
 
 
 def names(result):

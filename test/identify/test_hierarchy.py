@@ -10,8 +10,7 @@ from scipy.stats import multivariate_normal, norm
 
 from beetle_omni_ros.identify.inference.hierarchy import design, solve, Spread, WIDTH
 from beetle_omni_ros.identify.inference.least_squares import bounded_step, log_orthant
-from beetle_omni_ros.identify.inference.noise import Drifting, drifting
-from beetle_omni_ros.identify.inference.robust import HUBER
+from beetle_omni_ros.identify.inference.noise import Drifting, drifting, HUBER
 
 JOINTS, LOGS = (1, 2, 3, 1, 2, 3), (0, 0, 0, 1, 1, 1)
 LABELS = {'joint': JOINTS, 'log': LOGS}

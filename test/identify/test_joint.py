@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 from servo_logs import COUNT, log_of, sweep, trapezoid
 
-from beetle_omni_ros.identify.servo.joint import identify, interval, joint_results, left_out_rms
-from beetle_omni_ros.identify.servo.model import INDEX
+from beetle_omni_ros.identify.servo.fit import KINDS, Servos
+from beetle_omni_ros.identify.servo.model import file_sets, INDEX
+from beetle_omni_ros.identify.servo.results import (
+    identify,
+    interval,
+    joint_results,
+    left_out_rms,
+)
 from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
@@ -66,6 +72,16 @@ def test_a_slow_log_determines_the_lag_and_the_friction():
     bands = [sum(servo.get(key, 0.0) for key in ('coulomb', 'backlash')) for servo in SERVOS]
     assert one.values()[:, [INDEX['coulomb_friction'], INDEX['backlash']]].sum(axis=1) \
         == pytest.approx(bands, abs=0.004)
+
+
+def test_two_logs_may_show_different_kinds_of_motion():
+    t, command = sweep(3.0, periods=(0.3, 0.6), amplitudes=(0.3, 0.6))
+    slow = log_of(t, 0.2 * command, SERVOS[:1], seed=2)
+    for logs in ([made('fast'), slow], [slow, made('fast')]):
+        servos = Servos(logs, file_sets(ROBOT, flown=True))
+        fit = servos.fit(('joint_offset',), starts=({},)).fit
+        assert max(block.max() for block in servos.blocks) < len(fit.held) <= 2 * KINDS
+        assert np.isfinite(fit.held).all()
 
 
 def test_only_a_slow_log_confounds_delay_and_bandwidth():

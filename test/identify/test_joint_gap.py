@@ -9,12 +9,11 @@ import pytest
 from servo_logs import log_of, servo, sweep, write
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.identify.gap.apply import effects_with
+from beetle_omni_ros.identify.flights.apply import effects_with
 from beetle_omni_ros.identify.servo.compare import compare, gap_of
-from beetle_omni_ros.identify.servo.joint import identify, joint_results, Line
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
-from beetle_omni_ros.identify.servo.model import simulate
-from beetle_omni_ros.identify.servo.robot import file_sets, own_delay
+from beetle_omni_ros.identify.servo.model import file_sets, own_delay, simulate
+from beetle_omni_ros.identify.servo.results import identify, joint_results, Line
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.servo import play
 

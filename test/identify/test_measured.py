@@ -11,7 +11,7 @@ from servo_logs import log_of, sweep, write
 import yaml
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.identify.servo.robot import own_delay
+from beetle_omni_ros.identify.servo.model import own_delay
 from beetle_omni_ros.model.parameters import RobotParameters, value_of
 from beetle_omni_ros.model.resources import share_path
 

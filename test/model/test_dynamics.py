@@ -103,3 +103,13 @@ def test_a_shifted_centre_of_mass_is_the_same_body_seen_from_another_point():
         np.cross(at_centre[1], lever) + np.cross(w, np.cross(w, lever)))
     assert np.allclose(angular, at_centre[1], atol=1e-9)
     assert np.allclose(linear, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize('name', CATALOGUE)
+def test_a_declaration_is_complete_and_consistent(name):
+    effect = CATALOGUE[name]
+    assert effect.source
+    for spec in effect.parameters.values():
+        neutral = np.array(spec.neutral, dtype=float)
+        assert np.isnan(neutral).all() == bool(spec.number)
+        assert np.all(np.isnan(neutral) | (neutral >= spec.low) & (neutral <= spec.high))

@@ -17,9 +17,7 @@ PLAIN = Servo.of(ROBOT.joints)
 KINDS = {
     'plain': Servo.of(ROBOT.joints, velocity_limit=None, effort_limit=None),
     'limits': Servo.of(ROBOT.joints, effort_limit=0.05, position_limit=0.5),
-    'friction': Servo.of(ROBOT.joints, coulomb=0.01, stiction=0.03),
-    'fading': Servo.of(ROBOT.joints, coulomb=0.01, stiction=0.03, fading_rate=0.2,
-                       gaussian=False)}
+    'friction': Servo.of(ROBOT.joints, coulomb=0.01, stiction=0.03)}
 
 
 def states(count=200, seed=0):

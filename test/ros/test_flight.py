@@ -26,6 +26,7 @@ from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.ros import fly as fly_module
 from beetle_omni_ros.ros.graph import Graph, in_simulated_time
 
+OBSERVER = f'{Path(__file__).parents[2]}/examples/own_component.py:WrenchObserver'
 NODES = ('recorder_node', 'sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node',
          'reference_node')
 
@@ -63,8 +64,8 @@ def loses_one_node_after_another(graph, witness, bag):
     graph.kill('recorder_node')
     assert witness.stays_in_the_air(0.5)
     log = read_bag(bag)
-    assert killed_at - 0.6 < log.imu_t[-1] < killed_at + 0.1
-    assert len(log.imu_t) > 400 and len(log.command_t) > 100 and log.targets
+    assert killed_at - 0.6 < log.imu.t[-1] < killed_at + 0.1
+    assert len(log.imu.t) > 400 and len(log.command.t) > 100 and log.targets
 
     graph.kill('reference_node')
     assert witness.stays_in_the_air(0.5)
@@ -98,9 +99,10 @@ def flying(tmp_path):
     task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
     temporary.mkdir()
     process = subprocess.Popen(
-        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--task', str(task), '--bag',
-         str(bag), '--alone', '--clock', 'simulated'], stderr=subprocess.PIPE,
-        stdout=subprocess.PIPE, text=True, env={**os.environ, 'TMPDIR': str(temporary)})
+        [sys.executable, '-m', 'beetle_omni_ros', 'fly', '--task', str(task), '--bag',
+         str(bag), '--alone', '--clock', 'simulated', '--component', OBSERVER],
+        stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, 'TMPDIR': str(temporary)})
     deadline = time.monotonic() + READY
     try:
         while not any(b'flying:nmpc' in file.read_bytes() for file in bag.glob('*.mcap')):
@@ -135,6 +137,7 @@ def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
     assert process.returncode == 130
     log = read_bag(bag)
     assert not log.warnings and log.states[-1] == 'flying:nmpc' and log.meta['interrupted']
+    assert any(b'/observer/force' in file.read_bytes() for file in bag.glob('*.mcap'))
     result = metrics(log, make_task(str(tmp_path / 'poses.csv')))
     assert not result['crashed'] and len(result['poses']) < 10
 
@@ -194,11 +197,11 @@ def test_a_full_disk_ends_the_flight_with_one_line_and_the_bag_is_readable(tmp_p
     task, bag, limit = tmp_path / 'poses.csv', tmp_path / 'bag', 3 * 2**20
     task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
     done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--task', str(task), '--bag',
+        [sys.executable, '-m', 'beetle_omni_ros', 'fly', '--task', str(task), '--bag',
          str(bag), '--alone', '--clock', 'simulated', '--controller', 'hover'],
         capture_output=True, text=True, timeout=READY, check=False,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)))
     assert done.returncode == 1
     assert done.stderr == f'beetle_omni fly: error: {bag}: File too large\n'
     assert len(done.stdout.splitlines()) == 1       # how to watch it
-    assert len(read_bag(bag).truth_t) > 100
+    assert len(read_bag(bag).truth.t) > 100

@@ -16,9 +16,8 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
 from beetle_omni_ros.bags.bag import read_bag, read_messages
-from beetle_omni_ros.bags.bag_types import from_bytes
+from beetle_omni_ros.bags.messages import from_bytes, MessageError
 from beetle_omni_ros.bags.topics import ALL, COMMAND, EVENT, LATCHED, SENSOR
-from beetle_omni_ros.bags.values import MessageError
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.flight.component import ERROR, IDENTITY, Input

@@ -9,10 +9,9 @@ import pytest
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from beetle_omni_ros.bags.bag_types import from_bytes
 from beetle_omni_ros.bags.bag_writer import FRAMES
+from beetle_omni_ros.bags.messages import Diagnostic, from_bytes
 from beetle_omni_ros.bags.topics import SENSOR
-from beetle_omni_ros.bags.values import Diagnostic
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.drivers.findings import check_topics
 from beetle_omni_ros.model.body import BodyState

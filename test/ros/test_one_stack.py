@@ -19,11 +19,11 @@ from beetle_omni_ros.bags.log import LogRecorder
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.loop import ARMING_TIME, FlightLoop
-from beetle_omni_ros.flight.reference import Reference
+from beetle_omni_ros.flight.surroundings import TaskReference
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.ros.graph import COMPOSED, in_simulated_time
 from beetle_omni_ros.ros.operator import Operator
-from beetle_omni_ros.sim.fault_lists import parse_faults
+from beetle_omni_ros.sim.faults import parse_faults
 
 ARM, FAULT, SWITCH, LAND, END = ARMING_TIME, 5.0, 6.5, 8.0, 15.0   # [s] of the simulation
 FAULTS, SEED = 'mocap_lost duration=0.4; rotor_weak rotor=2 share=0.9', 5
@@ -60,7 +60,7 @@ def in_the_loop(task, epoch):
         name: registry.find(name).make(ROBOT) for name in ('nmpc', 'rl')}
     loop = FlightLoop(ROBOT, ROBOT, controllers, recorder, seed=SEED, conditions='published',
                       epoch=epoch)
-    loop.add(Reference(make_task(task), lambda mass: None))
+    loop.add(TaskReference(make_task(task), lambda mass: None))
     for moment, act in ((ARM, partial(loop.request, 'arm')),
                         (FAULT, lambda: loop.simulator.set_faults(parse_faults(FAULTS)) or True),
                         (SWITCH, partial(loop.select, 'rl')),
@@ -80,29 +80,28 @@ def flown(tmp_path_factory):
     task.write_text(HEADER + '0.3,0,1.2,15,0,20\n0,0.4,1.4,0,-40,-30\n')
     with reserved_domain() as domain:
         graph = in_the_graph(task, folder, domain)
-    epoch = int(np.floor(graph.truth_t[0]))
+    epoch = int(np.floor(graph.truth.t[0]))
     return SimpleNamespace(graph=graph, loop=in_the_loop(task, epoch), epoch=epoch)
 
 
-def both(flown, times, *values, after=0.0, until=END):
+def both(flown, series, *channels, after=0.0, until=END):
     """Values of both logs at their common stamps, which are nearly all in the interval."""
-    stamps = [np.round(getattr(log, times) - flown.epoch, 4) for log in (flown.graph, flown.loop)]
+    logs = [getattr(log, series) for log in (flown.graph, flown.loop)]
+    stamps = [np.round(log.t - flown.epoch, 4) for log in logs]
     common, *at = np.intersect1d(*stamps, return_indices=True)
     inside = (common >= after) & (common < until)
     assert inside.sum() >= 0.99 * max(np.sum((t >= after) & (t < until)) for t in stamps) > 0
-    for name in values:
-        yield tuple(getattr(log, name)[k][inside] for log, k in zip(
-            (flown.graph, flown.loop), at))
+    for channel in channels:
+        yield tuple(getattr(log, channel)[k][inside] for log, k in zip(logs, at))
 
 
 def assert_equal_flights(flown, **window):
-    for times, *values in (
-            ('truth_t', 'truth_position', 'truth_quaternion'),
-            ('odom_t', 'odom_position', 'odom_velocity', 'odom_quaternion',
-             'odom_angular_velocity'),
-            ('command_t', 'command_tilt', 'command_thrust')):
-        for name, (graph, loop) in zip(values, both(flown, times, *values, **window)):
-            assert np.abs(graph - loop).max() < BOUND, name
+    for series, *channels in (
+            ('truth', 'position', 'quaternion'),
+            ('odom', 'position', 'velocity', 'quaternion', 'angular_velocity'),
+            ('command', 'tilt', 'thrust')):
+        for name, (graph, loop) in zip(channels, both(flown, series, *channels, **window)):
+            assert np.abs(graph - loop).max() < BOUND, (series, name)
 
 
 def test_a_move_is_the_same_flight_in_the_graph_and_in_the_loop(flown):
@@ -116,8 +115,8 @@ def test_a_move_is_the_same_flight_in_the_graph_and_in_the_loop(flown):
 
 def test_a_fault_is_the_same_flight(flown):
     assert_equal_flights(flown, after=FAULT, until=SWITCH)
-    with_fault = (flown.graph.mocap_t > flown.epoch + FAULT + 0.05) \
-        & (flown.graph.mocap_t < flown.epoch + FAULT + 0.35)
+    with_fault = (flown.graph.mocap.t > flown.epoch + FAULT + 0.05) \
+        & (flown.graph.mocap.t < flown.epoch + FAULT + 0.35)
     assert not with_fault.any()
 
 

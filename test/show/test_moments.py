@@ -25,9 +25,9 @@ def log():
 def test_moments_agree_with_the_log(log):
     before, first, later, after = moments(log, np.array([3.0, 50.5, 60.0, 99.0]))
     assert before is None and after is None
-    k = np.searchsorted(log.truth_t, 60.0 - 1e-6)
-    np.testing.assert_allclose(later.position, log.truth_position[k])
-    np.testing.assert_allclose(later.quaternion, log.truth_quaternion[k])
+    k = np.searchsorted(log.truth.t, 60.0 - 1e-6)
+    np.testing.assert_allclose(later.position, log.truth.position[k])
+    np.testing.assert_allclose(later.quaternion, log.truth.quaternion[k])
     np.testing.assert_allclose(first.target[0], log.targets[0].position)
     np.testing.assert_allclose(later.target[0], log.targets[1].position)
     away = 1e3 * np.linalg.norm(later.position - log.targets[1].position)

@@ -2,7 +2,7 @@
 The plant, in MuJoCo and numpy, and the CasADi model agree; each has its own equations.
 
 Each effect is compared but for the friction of the servos, whose law both take from
-:mod:`robot.servo`, and ``module_reaction``: there the plant has bodies and the model approximates
+:mod:`model.servo`, and ``module_reaction``: there the plant has bodies and the model approximates
 them (``benchmarks/multibody_difference.py`` has the difference).
 """
 
@@ -33,17 +33,16 @@ EFFECTS = {
     'rotor_hub_moment': {'rotor_hub_moment': {'coefficient': 0.1}},
     'axial_inflow': {'axial_inflow': {'per_rotor': 0.4}},
     'translational_lift': {'translational_lift': {'per_rotor': 0.03}},
-    'tilt_thrust_loss': {'tilt_thrust_loss': {'loss_at_60deg': 0.06, 'cosine_share': 0.3}},
-    'ground_effect': {'ground_effect': {'gain_at_0.25m': 0.2, 'exponential_share': 0.4}},
+    'tilt_thrust_loss': {'tilt_thrust_loss': {'loss_at_60deg': 0.06}},
+    'ground_effect': {'ground_effect': {'gain_at_0.25m': 0.2}},
     'propeller_gyroscopic_torque': {'propeller_gyroscopic_torque': {
-        'angular_momentum_at_hover': 0.066, 'spin_up_share': 0.7}},
+        'angular_momentum_at_hover': 0.066}},
     'rotor_acceleration_torque': {'rotor_acceleration_torque': {
         'angular_momentum_at_hover': 0.05}},
     'voltage_sag': {'voltage_sag': {'exponent': 1.3}},
 }
 EFFECTS['all'] = {name: values for each in EFFECTS.values() for name, values in each.items()}
-SERVOS = {'joint_deflection': {'deflection_per_newton': 0.002},
-          'propeller_gyroscopic_torque': {'angular_momentum_at_hover': 0.066, 'joint_share': 0.8}}
+SERVOS = {'joint_deflection': {'deflection_per_newton': 0.002}}
 NOT_COMPARED = {'joint_friction', 'module_reaction'}    # see above
 VOLTAGE_RATIO = 0.87
 LOW, HIGH = 0.6, 10.0       # [m], the lower in reach of the ground effect
@@ -92,13 +91,12 @@ def test_plant_without_module_inertia_agrees_with_casadi(robot):
 def test_loads_of_the_servos_agree_with_the_model():
     robot = replace(ROBOT, effects=SERVOS)
     loads = ServoLoads(robot)
-    for _, _, _, rate, tilt, _, thrust in random_states(20, seed=4):
-        targets, torques = loads(tilt + 0.1, tilt, rate, thrust)
+    for *_, tilt, _, thrust in random_states(20, seed=4):
+        targets, torques = loads(tilt, thrust)
         for i in range(4):
-            gyroscopic = dynamics.gyroscopic_load(robot, rate, tilt[i], thrust[i], i)
-            _, terms = dynamics.tilt_servo(robot, i, tilt[i] + 0.1, thrust[i], float(gyroscopic))
+            _, terms = dynamics.tilt_servo(robot, i, tilt[i], thrust[i])
             assert targets[i] == pytest.approx(terms.target, rel=1e-12)
-            assert torques[i] == pytest.approx(terms.load, rel=1e-6)
+            assert torques[i] == terms.load == 0.0
 
 
 @pytest.mark.parametrize('effects', [

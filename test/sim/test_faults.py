@@ -12,8 +12,15 @@ from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim import sensors
 from beetle_omni_ros.sim import simulator as whole
-from beetle_omni_ros.sim.fault_lists import load_cases, load_faults, parse_faults
-from beetle_omni_ros.sim.faults import Fault, KINDS, OF_PROCESSES, READINGS
+from beetle_omni_ros.sim.fault_kinds import KINDS
+from beetle_omni_ros.sim.faults import (
+    Fault,
+    load_cases,
+    load_faults,
+    OF_PROCESSES,
+    parse_faults,
+    READINGS,
+)
 from beetle_omni_ros.sim.simulator import Simulator
 
 HOVER = np.full(4, ROBOT.hover_thrust)

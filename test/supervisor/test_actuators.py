@@ -7,7 +7,7 @@ from vehicle_rig import flown, TICK, VehicleRig
 
 def report(rig, name, text):
     """Give a bridge state to the supervisor, and one step."""
-    rig.supervisor.on_actuators(name, text, rig.now)
+    rig.supervisor.inputs.on_actuators(name, text, rig.now)
     rig.run(TICK)
 
 
@@ -59,7 +59,7 @@ def report_speeds(rig):
     def with_speeds():
         publish()
         if factors.all():
-            rig.supervisor.on_rotors(rig.now, factors * np.sqrt(rig.thrust))
+            rig.supervisor.inputs.on_rotors(rig.now, factors * np.sqrt(rig.thrust))
 
     rig._publish = with_speeds
     return factors
@@ -80,12 +80,12 @@ def test_no_rotor_is_isolated_while_commands_are_late(late):
 @pytest.mark.parametrize('late', [False, True])
 def test_no_joint_is_isolated_while_commands_are_late(late):
     rig = flown()
-    on_joints = rig.supervisor.on_joints
+    on_joints = rig.supervisor.inputs.on_joints
     rig.age['nmpc'] = 0.03 if late else 0.0
-    rig.supervisor.on_joints = lambda stamp, tilt, rate: on_joints(
+    rig.supervisor.inputs.on_joints = lambda stamp, tilt, rate: on_joints(
         stamp, tilt + [0.4, 0.0, 0.0, 0.0], rate)
     rig.run(0.2)
-    rig.supervisor.on_joints = on_joints
+    rig.supervisor.inputs.on_joints = on_joints
     rig.run(1.0)
     assert ('joint1_astray' in rig.supervisor.faults) is not late
     assert rig.supervisor.state == ('fallback' if late else 'landing')
@@ -94,14 +94,14 @@ def test_no_joint_is_isolated_while_commands_are_late(late):
 def test_without_their_bridge_the_joints_count_as_stopped_where_they_were():
     rig = flown()
     report(rig, 'joint', 'ready')
-    angles = rig.supervisor.tilt
+    angles = rig.supervisor.inputs.tilt
     rig.alive.discard('joints')
     rig.velocity = np.array([0.3, 0.0, 0.0])
     rig.run(0.3)
     assert rig.supervisor.mode == 'landing:joint_bridge_lost'
     assert any(text.startswith('joint_bridge_node silent for') for text in rig.texts('error'))
     assert np.abs(rig.command.tilt - angles).max() > 0.01
-    assert np.array_equal(rig.supervisor.seen.tilt, angles)
+    assert np.array_equal(rig.supervisor._seen.tilt, angles)
 
 
 def test_a_rotor_bridge_that_is_silent_is_named_before_the_robot_reaches_the_floor():

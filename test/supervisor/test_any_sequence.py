@@ -6,7 +6,7 @@ import numpy as np
 from vehicle_rig import flown, LEVEL, ROBOT, VehicleRig
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.supervisor.supervisor import AGE_LIMIT
+from beetle_omni_ros.model.mode import COMMAND_AGE
 
 RUBBISH = [np.nan, np.inf, -np.inf, 1e300, -1e9, 0.0, 1.0, 3.9, -4.1, 25.0, -0.5]
 numbers = st.one_of(st.sampled_from(RUBBISH), st.floats(-30, 30))
@@ -39,25 +39,26 @@ def perform(rig, action):
         rig.now += rest[0]
         supervisor.update(rig.now)
     elif kind == 'command':
-        supervisor.on_command(rest[0], Command(rig.now + rest[1], rest[2], rest[3]),
+        supervisor.inputs.on_command(rest[0], Command(rig.now + rest[1], rest[2], rest[3]),
                               rig.now)
     elif kind == 'spoil':
         # One wrong number in a new, otherwise good command.
         values = np.concatenate([np.zeros(4), np.full(4, ROBOT.hover_thrust)])
         values[rest[1]] = rest[0]
-        supervisor.on_command(supervisor.active, Command(rig.now + 0.01, values[:4],
+        supervisor.inputs.on_command(supervisor.active, Command(rig.now + 0.01, values[:4],
                                                          values[4:]), rig.now)
     elif kind == 'state':
-        supervisor.on_state(State(rig.now + rest[0], rest[1][:3], rest[2][:3], LEVEL, rest[3][:3],
-                                  rest[3], rest[2], rig.now + rest[0]))
+        supervisor.inputs.on_state(State(
+            rig.now + rest[0], rest[1][:3], rest[2][:3], LEVEL, rest[3][:3], rest[3], rest[2],
+            rig.now + rest[0]))
     elif kind == 'raw':
-        supervisor.on_imu(rig.now + rest[0], rest[1][:3], rest[2][:3])
-        supervisor.on_mocap(rig.now + rest[0], rest[1][:3], rest[2])
-        supervisor.on_joints(rig.now + rest[0], rest[1], rest[2])
+        supervisor.inputs.on_imu(rig.now + rest[0], rest[1][:3], rest[2][:3])
+        supervisor.inputs.on_mocap(rig.now + rest[0], rest[1][:3], rest[2])
+        supervisor.inputs.on_joints(rig.now + rest[0], rest[1], rest[2])
     elif kind == 'battery':
-        supervisor.on_battery(rest[0])
+        supervisor.inputs.on_battery(rest[0])
     elif kind == 'bridge':
-        supervisor.on_actuators(*rest, rig.now)
+        supervisor.inputs.on_actuators(*rest, rig.now)
     elif kind == 'toggle':
         rig.alive ^= {rest[0]}
     elif rest[0] in ('nmpc', 'rl', 'x'):
@@ -75,7 +76,7 @@ def watch(rig, command):
     assert command.tilt.shape == command.thrust.shape == (4,)
     assert np.abs(command.tilt).max() <= ROBOT.joints.position_limit
     assert command.thrust.min() >= 0 and command.thrust.max() <= ROBOT.rotors.thrust_max
-    assert supervisor._now - command.stamp <= AGE_LIMIT + 1e-9
+    assert supervisor.inputs._now - command.stamp <= COMMAND_AGE + 1e-9
     if supervisor.state in ('disarmed', 'emergency_stop'):
         assert not command.thrust.any()
 

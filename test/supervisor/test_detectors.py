@@ -11,8 +11,7 @@ from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.servo import NUMPY, Servo, Step
 from beetle_omni_ros.supervisor import readings, wrench
 from beetle_omni_ros.supervisor.detectors import FaultWatch
-from beetle_omni_ros.supervisor.readings import JointWatch
-from beetle_omni_ros.supervisor.speeds import SpeedWatch
+from beetle_omni_ros.supervisor.readings import JointWatch, SpeedWatch
 from beetle_omni_ros.supervisor.wrench import ContactWatch, WrenchWatch
 
 ROBOT = RobotParameters.load()

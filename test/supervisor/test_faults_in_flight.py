@@ -13,11 +13,11 @@ def test_an_impact_near_the_floor_stops_the_motors_for_good():
     rig = flown()
     rig.position = np.array([0.3, -0.2, 0.25])
     rig.run(0.05)
-    rig.supervisor.on_imu(rig.now + 0.001, np.array([0, 0, 120.0]), np.zeros(3))
+    rig.supervisor.inputs.on_imu(rig.now + 0.001, np.array([0, 0, 120.0]), np.zeros(3))
     rig.run(0.05)
     assert rig.supervisor.state == 'flying', 'a lone sample is a spike of the sensor'
     for after in (0.001, 0.006):
-        rig.supervisor.on_imu(rig.now + after, np.array([0, 0, 120.0]), np.zeros(3))
+        rig.supervisor.inputs.on_imu(rig.now + after, np.array([0, 0, 120.0]), np.zeros(3))
     sent = rig.run(0.1)
     assert rig.supervisor.state == 'emergency_stop'
     assert rig.supervisor.mode == 'emergency_stop:crash'
@@ -33,7 +33,7 @@ def test_a_pause_in_the_air_ends_in_fallback_and_on_the_floor_with_motors_off():
     assert any(command and command.thrust.any() for command in rig.run(0.05))
     assert 'supervisor_paused' in rig.supervisor.faults
     assert rig.supervisor.state in ('fallback', 'flying')
-    severities = [event.severity for event in rig.supervisor.events if 'paus' in event.text
+    severities = [event.severity for event in rig.supervisor.inputs.events if 'paus' in event.text
                   or 'not scheduled' in event.text]
     assert set(severities) == {'warning'}, 'the robot survived it'
     rig = flown()
@@ -95,8 +95,8 @@ def test_a_turn_of_the_markers_or_of_the_estimate_is_named_and_leads_to_a_landin
     attitude, turned = rig.quaternion, rotations.from_rpy(0, 0, np.pi / 2)
     if wrong == 'mocap':
         rig.quaternion = turned
-    on_state = rig.supervisor.on_state
-    rig.supervisor.on_state = lambda state, now: on_state(
+    on_state = rig.supervisor.inputs.on_state
+    rig.supervisor.inputs.on_state = lambda state, now: on_state(
         replace(state, quaternion=attitude if wrong == 'mocap' else turned), now)
     rig.run(2.0)
     assert fault in rig.supervisor.faults

@@ -85,7 +85,7 @@ def test_fallback_and_landing_start_from_the_joints_and_not_from_a_far_target(be
     rig._publish = late
     rig.alive.discard('nmpc')
     for far in (2.9, 3.0):
-        rig.supervisor.on_command(
+        rig.supervisor.inputs.on_command(
             'nmpc', Command(rig.now + TICK, joints + far, rig.command.thrust), rig.now)
         rig.run(TICK)
     assert np.abs(rig.command.tilt - joints).min() > 2.5
@@ -98,7 +98,8 @@ def test_fallback_and_landing_start_from_the_joints_and_not_from_a_far_target(be
 def test_a_controller_whose_commands_are_not_finite_loses_control_with_the_reason():
     rig = flown()
     rig.alive.discard('nmpc')
-    rig.supervisor.on_command('nmpc', Command(rig.now, np.full(4, np.nan), np.ones(4)), rig.now)
+    bad = Command(rig.now, np.full(4, np.nan), np.ones(4))
+    rig.supervisor.inputs.on_command('nmpc', bad, rig.now)
     rig.run(TIMEOUT)
     assert rig.supervisor.state == 'fallback'
     assert any('last refused: not finite' in text for text in rig.texts('error'))
@@ -128,7 +129,7 @@ def test_commands_that_stay_late_fall_back_with_the_reason_until_they_are_punctu
     assert any('nmpc_node late: median age 30 ms' in text for text in rig.texts('error'))
     rig.run(2.0)
     assert rig.supervisor.state == 'fallback'
-    assert 'late' in rig.supervisor.streams['nmpc'].complaint
+    assert 'late' in rig.supervisor.inputs.streams['nmpc'].complaint
     rig.age['nmpc'] = 0.0
     rig.run(RETURN_AFTER)
     assert rig.supervisor.state == 'fallback'
@@ -192,7 +193,7 @@ def test_joint_that_does_not_follow_stops_the_takeoff_before_the_rotors_start():
 
     def with_stuck_joint():
         publish()
-        rig.supervisor.tilt = stuck
+        rig.supervisor.inputs.tilt = stuck
 
     rig._publish = with_stuck_joint
     rig.run(0.6)
@@ -211,7 +212,7 @@ def test_silent_estimator_or_joints_lead_to_a_landing_that_names_the_node(source
     rig.run(delay + 2 * TICK)
     assert rig.supervisor.state == 'landing' and rig.supervisor.source == 'hover'
     assert any(text.startswith(f'{name} silent for') for text in rig.texts('error'))
-    assert rig.supervisor.backup.running == (source == 'estimate')
+    assert rig.supervisor.inputs.backup.running == (source == 'estimate')
 
 
 def test_loss_of_all_sensors_stops_the_motors():
@@ -224,7 +225,7 @@ def test_loss_of_all_sensors_stops_the_motors():
 
 def test_low_battery_warns_then_lands():
     rig = VehicleRig().fly()
-    rig.supervisor.watch._pack = None   # the voltage falls without a load
+    rig.supervisor.inputs.watch._pack = None   # the voltage falls without a load
     full = rig.voltage
     rig.voltage = (PARAMETERS.battery_land - 0.05) * ROBOT.battery.cells
     rig.run(LOW_TIME / 2)     # the sag of a manoeuvre
@@ -244,11 +245,11 @@ def test_low_battery_warns_then_lands():
 def test_a_pack_that_sags_under_the_same_load_leads_to_a_landing_within_half_a_second():
     rig = flown()
     rig.run(1.0)
-    assert rig.supervisor.health.healthy
+    assert rig.supervisor.inputs.health.healthy
     rig.voltage -= 6.0
     rig.run(0.5)
     assert rig.supervisor.state == 'landing' and 'battery_weak' in rig.supervisor.faults
-    limit = rig.supervisor.health.thrust_limit
+    limit = rig.supervisor.inputs.health.thrust_limit
     assert ROBOT.hover_thrust < limit < 2 * ROBOT.hover_thrust
     assert all(command.thrust.max() <= limit + 1e-9 for command in rig.run(0.5))
 
@@ -257,9 +258,10 @@ def test_a_pack_that_sags_under_the_same_load_leads_to_a_landing_within_half_a_s
 def test_with_a_weak_pack_a_low_robot_on_its_back_climbs_before_it_turns_over(height, climbs):
     rig = flown()
     supervisor, start = rig.supervisor, rig.position
+    end = np.array([0.3, -0.2, supervisor.inputs.floor + height])
     for part in np.linspace(0.0, 1.0, 500):
         rig.quaternion = rotations.from_rpy(np.pi * part, 0.0, 0.0)
-        rig.position = (1 - part) * start + part * np.array([0.3, -0.2, supervisor.floor + height])
+        rig.position = (1 - part) * start + part * end
         rig.run(TICK)
     rig.voltage -= 6.0
     rig.run(0.5)
@@ -268,7 +270,7 @@ def test_with_a_weak_pack_a_low_robot_on_its_back_climbs_before_it_turns_over(he
     turned = [inclination(quaternion) < 0.5 * np.pi for quaternion in way.quaternions]
     assert any(turned) is not climbs
     if climbs:
-        top = supervisor.floor + TURN_HEIGHT
+        top = supervisor.inputs.floor + TURN_HEIGHT
         assert way.positions[-1, 2] > top
         while rig.position[2] <= top and rig.now < way.times[-1]:
             rig.position = way.at(rig.now).position
@@ -311,11 +313,11 @@ def test_bad_estimates_are_refused_and_counted(change, reason):
     rig = VehicleRig()
     rig.run(0.1)
     repeat = change.pop('_repeat', False)
-    good = rig.supervisor.estimate
+    good = rig.supervisor.inputs.estimate
     bad = good if repeat else replace(good, **{'stamp': rig.now + TICK, **change})
-    assert not rig.supervisor.on_state(bad)
+    assert not rig.supervisor.inputs.on_state(bad)
     assert rig.supervisor.diagnostics()[f'refused.estimate: {reason}'] == 1
-    assert rig.supervisor.estimate is good
+    assert rig.supervisor.inputs.estimate is good
 
 
 @pytest.mark.parametrize('change, refused', [
@@ -326,13 +328,13 @@ def test_a_single_jump_of_the_estimate_is_refused_and_a_lasting_one_accepted(cha
     rig = VehicleRig()
     rig.run(0.1)
     supervisor = rig.supervisor
-    good = supervisor.estimate
+    good = supervisor.inputs.estimate
     jumped = [replace(good, stamp=rig.now + k * TICK, **{
         name: good.position + value if name == 'position' else value
         for name, value in change.items()}) for k in (1, 2)]
-    assert rig.supervisor.on_state(jumped[0]) is not refused
-    assert supervisor.estimate is (good if refused else jumped[0])
+    assert rig.supervisor.inputs.on_state(jumped[0]) is not refused
+    assert supervisor.inputs.estimate is (good if refused else jumped[0])
     answer = Command(jumped[0].stamp, good.tilt, np.full(4, 7.0))
-    assert supervisor.on_command('nmpc', answer, rig.now + TICK) is not refused
-    assert rig.supervisor.on_state(jumped[1])
-    assert supervisor.estimate is jumped[1]
+    assert supervisor.inputs.on_command('nmpc', answer, rig.now + TICK) is not refused
+    assert rig.supervisor.inputs.on_state(jumped[1])
+    assert supervisor.inputs.estimate is jumped[1]

@@ -9,7 +9,7 @@ from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.model.allocation import Allocator
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.supervisor.parameters import SupervisorParameters
+from beetle_omni_ros.supervisor.interface import SupervisorParameters
 from beetle_omni_ros.supervisor.supervisor import Supervisor
 
 ROBOT = RobotParameters.load()
@@ -64,17 +64,17 @@ class VehicleRig:
             self.run(0.1)
             if self.supervisor.state == 'flying':
                 return self
-        raise AssertionError(f'never flew: {self.supervisor.events}')
+        raise AssertionError(f'never flew: {self.supervisor.inputs.events}')
 
     def texts(self, severity=None):
         """All event texts, of one severity."""
-        return [e.text for e in self.supervisor.events if severity in (None, e.severity)]
+        return [e.text for e in self.supervisor.inputs.events if severity in (None, e.severity)]
 
     def _specific_force(self, tilt):
         """Specific force: of the rotors in the air, of the ground on the floor."""
         asked = self.command.thrust if self.command is not None else np.zeros(4)
         self.thrust += -np.expm1(-TICK / ROBOT.rotors.time_constant) * (asked - self.thrust)
-        if self.supervisor.airborne:
+        if self.supervisor.inputs.airborne:
             return ALLOCATOR.wrench(tilt, self.thrust)[0] / ALLOCATOR.mass
         return np.array([0, 0, ROBOT.gravity])
 
@@ -83,23 +83,23 @@ class VehicleRig:
         tilt = self.command.tilt if self.command is not None else np.zeros(4)
         if 'imu' in alive:
             noise = 1e-6 * np.sin(1e3 * self.now + np.arange(6))   # readings have noise
-            supervisor.on_imu(self.now, self._specific_force(tilt) + noise[:3],
+            supervisor.inputs.on_imu(self.now, self._specific_force(tilt) + noise[:3],
                               self.rate + noise[3:])
         if 'mocap' in alive:
             noise = 1e-6 * np.array([round(self.now / TICK) % 2, 0, 0])
-            supervisor.on_mocap(self.now - 0.01, self.position + noise, self.quaternion)
+            supervisor.inputs.on_mocap(self.now - 0.01, self.position + noise, self.quaternion)
         stamp = self.now - 0.01 if 'joints' in alive else np.nan
         if 'joints' in alive:
-            supervisor.on_joints(stamp, tilt, np.zeros(4))
+            supervisor.inputs.on_joints(stamp, tilt, np.zeros(4))
         if 'estimate' in alive:
             noise = 1e-9 * np.sin(1e3 * self.now + np.arange(3))    # no two estimates are equal
-            supervisor.on_state(State(
+            supervisor.inputs.on_state(State(
                 self.now - self.age['estimate'], self.position + noise, self.velocity,
                 self.quaternion, self.rate, tilt, np.zeros(4), stamp), self.now)
-        supervisor.on_battery(self.voltage)
+        supervisor.inputs.on_battery(self.voltage)
         for name in ('nmpc', 'rl'):
             if name in alive:
-                supervisor.on_command(name, hover_command(self.now - self.age[name],
+                supervisor.inputs.on_command(name, hover_command(self.now - self.age[name],
                                                           self.quaternion), self.now)
 
 

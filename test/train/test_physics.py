@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from beetle_omni_ros.model.catalogue import validated
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.effects import CATALOGUE, validated
 from beetle_omni_ros.train import model, physics
 
 EFFECTS = validated({
@@ -22,8 +21,8 @@ EFFECTS = validated({
     'body_drag': {'coefficient': 0.11}, 'rotor_drag': {'coefficient': 0.4},
     'rotor_hub_moment': {'coefficient': 0.1},
     'axial_inflow': {'per_rotor': 0.3}, 'translational_lift': {'per_rotor': 0.03},
-    'tilt_thrust_loss': {'loss_at_60deg': 0.08, 'cosine_share': 0.4},
-    'ground_effect': {'gain_at_0.25m': 0.08, 'exponential_share': 0.3},
+    'tilt_thrust_loss': {'loss_at_60deg': 0.08},
+    'ground_effect': {'gain_at_0.25m': 0.08},
     'propeller_gyroscopic_torque': {'angular_momentum_at_hover': 0.06},
     'rotor_acceleration_torque': {'angular_momentum_at_hover': 0.03},
     'joint_offset': {'offset': [0.03, -0.02, 0.05, 0.0]}})

@@ -13,7 +13,7 @@ import socket
 import sys
 
 MODULES = ('beetle_omni_ros.cli', 'beetle_omni_ros.flight.evaluate',
-           'beetle_omni_ros.flight.faults', 'beetle_omni_ros.identify.gap.command',
+           'beetle_omni_ros.flight.faults', 'beetle_omni_ros.identify.flights.command',
            'beetle_omni_ros.show.report')
 CLIENT = """#!{python} -IS
 import json, os, socket, sys

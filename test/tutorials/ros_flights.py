@@ -30,7 +30,7 @@ def check_own_controller(folder):
 
     assert log.meta['faults'][1] == 'mocap_lost at=3 duration=0.3'
     begin = log.targets[0].stamp
-    late = log.mocap_t[(log.mocap_t > begin) & (log.mocap_t < begin + 7)]
+    late = log.mocap.t[(log.mocap.t > begin) & (log.mocap.t < begin + 7)]
     gap = (late[1:] - late[:-1]).argmax()
     assert late[gap + 1] - late[gap] == pytest.approx(0.3, abs=0.03)
     assert late[gap] - begin == pytest.approx(3.0, abs=0.3)

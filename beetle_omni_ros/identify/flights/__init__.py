@@ -1,8 +1,8 @@
 """
 Gap finder: differences between model and flights, and the effects that explain them.
 
-- ``table``, ``motion``, ``residual``; ``bag``: residuals of flights as tables, and as bags.
-- ``priors``, ``spectrum``, ``discrepancy``, ``evidence``, ``engine``: evidence of effects.
-- ``table_verdict``, ``bag_verdict``, ``results``, ``text``, ``page``: verdict, JSON, sentence,
-  tables, page.
+- ``keys``, ``body``, ``signals``, ``servo``; ``bag_flight``, ``table_flight``: residuals.
+- ``spectrum``, ``discrepancy``, ``evidence``, ``engine``: evidence of sets of effects.
+- ``quality``, ``balance``: shares, errors and further tests of a solution.
+- ``verdict``, ``results``, ``page``, ``apply``, ``command``: verdict, JSON, page, robot file.
 """

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from beetle_omni_ros.identify.flights.evidence import Posterior
-from beetle_omni_ros.identify.flights.priors import entries_of, keys_of, spread
+from beetle_omni_ros.identify.flights.keys import entries_of, keys_of, prior_of
 from beetle_omni_ros.model.parameters import RobotParameters
 
 SLOW = {'rotor_thrust_coefficient', 'rotor_hub_moment', 'centre_of_mass'}
@@ -40,9 +40,9 @@ class Balance:
                              for name in ('rotor_thrust_coefficient', 'rotor_hub_moment'))
         unit = np.where(self._rotors, [key.base for key in self.keys.values()], 1.0)
         self.entries = entries_of(keys_of(robot, SLOW - {'rotor_hub_moment'}))
-        spreads = [spread(robot, key, 0.0, 0.0) for key in self.keys.values()]
+        priors = [prior_of(robot, key, 0.0, 0.0) for key in self.keys.values()]
         self.narrow, self.typical, flight = np.array(
-            [[s.narrow, s.typical, s.flight] for s in spreads]).T
+            [[s.narrow, s.typical, s.flight] for s in priors]).T
         self.narrow[hub] += SCALES[-1] * self.typical[hub]
         # scatter of the means about a constant of each flight and the free hub moment
         y, slope = (np.concatenate([(x - x.mean(axis=0)).ravel() for x in xs]) for xs in (

@@ -17,6 +17,7 @@ from beetle_omni_ros.model.parameters import RobotParameters
 
 WAVES = 6               # random features
 LEAN = 0.3              # [rad] scale of the tilt of the body
+TURN, SWING = 1.0, 2.0  # [rad/s] scales of rates of the body and of tilts
 
 
 def discrepancies(flights: Sequence) -> list[np.ndarray]:
@@ -31,26 +32,31 @@ def discrepancies(flights: Sequence) -> list[np.ndarray]:
         and forces are of relative size one: hover thrust, and the weight.
 
     """
-    features = [_features(flight.motion, flight.time) for flight in flights]
+    features = [features_of(flight.motion, flight.time) for flight in flights]
     mean = np.concatenate(features).mean(axis=0)
     return [acting(flight.robot, flight.motion, own - mean, flight.channels)
             for flight, own in zip(flights, features, strict=True)]
 
 
-def _features(motion, time):
+def features_of(motion: dict[str, np.ndarray], time: np.ndarray, quick: bool = False
+                ) -> np.ndarray:
     """
-    (N, P) features of order one.
+    (N, P) features of order one, and cosines of random directions among these.
 
-    They are velocity in the body [m/s], tilt of the body, place [m], time [min] and cosines of
-    random directions among these.
+    They are velocity in the body [m/s], tilt of the body, place [m] and time [min]; the ``quick``
+    ones also tilts and rates.
     """
     rotation = Rotation.from_quat(motion['quaternion']).as_matrix()
     velocity = np.einsum('nji,nj->ni', rotation, motion['velocity'])
-    plain = np.concatenate([velocity, rotation[:, 2, :2] / LEAN, motion['position'],
-                            time[:, None] / 60], axis=1)
-    rng = np.random.default_rng(0)
-    waves = np.cos((plain - plain.mean(axis=0)) @ rng.normal(size=(plain.shape[1], WAVES))
-                   + rng.uniform(0, 2 * np.pi, WAVES))
+    lean = rotation[:, 2] if quick else rotation[:, 2, :2]
+    parts = [velocity, lean / LEAN, motion['position'], time[:, None] / 60]
+    if quick:
+        parts += [motion['tilt'], motion['tilt_rate'] / SWING, motion['rate'] / TURN]
+    plain = np.concatenate(parts, axis=1)
+    rng, count = np.random.default_rng(int(quick)), WAVES * (2 if quick else 1)
+    directions = rng.normal(size=(plain.shape[1], count))
+    along = plain @ directions / np.sqrt(3) if quick else (plain - plain.mean(axis=0)) @ directions
+    waves = np.cos(along + rng.uniform(0, 2 * np.pi, count))
     return np.concatenate([plain, waves], axis=1)
 
 

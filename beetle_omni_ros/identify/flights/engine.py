@@ -9,9 +9,8 @@ from itertools import combinations
 import numpy as np
 
 from beetle_omni_ros.identify.flights.discrepancy import discrepancies
-from beetle_omni_ros.identify.flights.evidence import Judge, normal
-from beetle_omni_ros.identify.flights.priors import Entry, Spread
-from beetle_omni_ros.identify.flights.solution import log_prior, Solution
+from beetle_omni_ros.identify.flights.evidence import Judge, log_prior, normal, Solution
+from beetle_omni_ros.identify.flights.keys import Entry, Prior
 from beetle_omni_ros.identify.flights.spectrum import (
     EDGES,
     pooled,
@@ -38,8 +37,7 @@ class Engine:
 
     Args:
         flights: objects with ``linear(theta, names)``, ``mask``, ``period`` and ``channels``.
-        names: (K,) keys.
-        spreads: their priors.
+        priors: keys and their priors.
         entries: catalogue entries that may be named.
         bounds: smallest and largest value of a key.
         kept: keys of tolerances that have bounds.
@@ -50,18 +48,18 @@ class Engine:
 
     """
 
-    def __init__(self, flights: Sequence, names: list[str], spreads: dict[str, Spread],
+    def __init__(self, flights: Sequence, priors: dict[str, Prior],
                  entries: list[Entry], bounds: dict[str, tuple[float, float]] | None = None,
                  far: frozenset[str] = frozenset(), alpha: float = 0.05,
                  progress: Callable[[str], None] = lambda text: None,
                  curved: frozenset[str] = frozenset(), varying: dict[str, float] | None = None,
                  kept: frozenset[str] = frozenset(), clock: str = ''):
-        self.flights, self.names, self.entries = list(flights), list(names), list(entries)
-        self.real = len(names)
-        spreads = self._late({**spreads, **self._repeat(spreads, varying or {})}, clock)
+        self.flights, self.names, self.entries = list(flights), list(priors), list(entries)
+        self.real = len(priors)
+        priors = self._late({**priors, **self._repeat(priors, varying or {})}, clock)
         names = self.names
         self.narrow, self.typical, self.flight = (np.array(
-            [getattr(spreads[name], kind) for name in names])
+            [getattr(priors[name], kind) for name in names])
             for kind in ('narrow', 'typical', 'flight'))
         self.bounds = np.array([(bounds or {}).get(name, (-np.inf, np.inf)) for name in names])
         self.kept = np.array([name in kept for name in names])
@@ -80,7 +78,7 @@ class Engine:
         self.far = np.array([name in far for name in self.names[:self.known]])
         self.curved = np.array([name in curved for name in self.names[:self.known]])
 
-    def _repeat(self, spreads, varying):
+    def _repeat(self, priors, varying):
         """
         Entries of what may differ from flight to flight, with a key for each flight.
 
@@ -89,7 +87,7 @@ class Engine:
         """
         # (flight, index of the key, index of its value in this flight)
         self.repeats: list[tuple[int, int, int]] = []
-        more: dict[str, Spread] = {}
+        more: dict[str, Prior] = {}
         if len(self.flights) < 2:
             return more
         for entry in [e for e in self.entries if set(e.keys) <= set(varying)]:
@@ -99,11 +97,11 @@ class Engine:
                     own.append(f'{key}#{k}')
                     self.repeats.append((k, self.names.index(key), len(self.names)))
                     self.names.append(own[-1])
-                    more[own[-1]] = Spread(SAME * varying[key], varying[key], 0.0)
+                    more[own[-1]] = Prior(SAME * varying[key], varying[key], 0.0)
             self.entries.append(replace(entry, keys=tuple(own), varying=True))
         return more
 
-    def _late(self, spreads, clock):
+    def _late(self, priors, clock):
         """
         Keys of the answer of feedback: forces and torques that are late, in each group of bands.
 
@@ -116,8 +114,8 @@ class Engine:
             own = [c for c, name in enumerate(self.flights[0].channels) if name.startswith(kind)]
             self.late[len(self.names)] = self.names.index(clock), own
             self.names.append(f'late {kind}')
-            spreads = spreads | {self.names[-1]: Spread(1e-3 * spreads[clock].typical, TURN, 0.0)}
-        return spreads
+            priors = priors | {self.names[-1]: Prior(1e-3 * priors[clock].typical, TURN, 0.0)}
+        return priors
 
     def _at(self, k, theta):
         """(R,) values of the real keys in flight k at all keys (K,)."""

@@ -1,16 +1,33 @@
-"""How well a solution explains flights: shares, discrepancies and errors before and after."""
+"""
+How well a solution explains flights: shares, discrepancies, errors, and what repeats unexplained.
+
+Two tests look at the residual of forces and torques after the fit. They know nothing of causes.
+
+- Repeatable: thrusts and forces as smooth functions of the motion, fitted on all blocks but one,
+  predict the block that is left out. Student's t of the gain over the blocks is the statistic, so
+  that what fits one block alone counts nothing.
+- Line: a frequency at which the whitened spectrum, the mean over the blocks, exceeds its
+  neighbours by more than exponentially distributed power allows.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import log
 
 import numpy as np
+from scipy.stats import f as f_law
+from scipy.stats import t as student
 
-from beetle_omni_ros.identify.flights.discrepancy import discrepancies
+from beetle_omni_ros.identify.flights.discrepancy import acting, discrepancies, features_of
 from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.solution import Solution
+from beetle_omni_ros.identify.flights.evidence import Solution
 from beetle_omni_ros.identify.flights.spectrum import pooled, Spectrum, spectrum
+
+SIZES = (0.001, 0.003, 0.01, 0.03, 0.1)     # amplitudes relative to hover thrust and weight
+SLOWEST = 1.0                               # [Hz] of a line; slower ones are the flight's own path
+NEAR = 12                                   # frequencies on each side that a line is compared with
 
 
 def fitted(engine: Engine, solution: Solution, k: int) -> np.ndarray:
@@ -114,3 +131,123 @@ def left_of(engine: Engine, solution: Solution) -> list[np.ndarray]:
             rest += found.slopes[:, :, :, key] * values[found.band][None, :, None]
         rows.append(rest)
     return rows
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """
+    Result of a test.
+
+    Attributes:
+        kind: 'repeatable' or 'line'.
+        probability: of a value as large without anything unexplained.
+        gain: logarithm of the likelihood that the left-out blocks gain [nat]; of a line, that of
+            its power.
+        channels: those that show it, the largest first.
+        frequency: of a line [Hz].
+
+    """
+
+    kind: str
+    probability: float
+    gain: float
+    channels: tuple[str, ...]
+    frequency: float | None = None
+
+    @property
+    def sentence(self) -> str:
+        """What was found, as the end of a sentence."""
+        what = f'a vibration of {self.frequency:.2g} Hz in ' + ' and '.join(
+            name.replace('_', ' ') for name in self.channels) if self.frequency else \
+            'a force or torque that depends on the motion and repeats'
+        return f'no known effect explains {what} (probability {self.probability:.1g})'
+
+
+def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
+               filters: list[np.ndarray], channels: tuple[str, ...]) -> Unexplained:
+    """
+    Test of a discrepancy that predicts blocks which it was not fitted to.
+
+    Args:
+        flights: with ``robot``, ``motion`` and ``time``.
+        spectra: of the flights.
+        left: (B, F, C) whitened residual of each flight after the fit.
+        filters: (C, L) whitening filters of each flight.
+        channels: names of all channels.
+
+    """
+    every = [features_of(flight.motion, flight.time, quick=True) for flight in flights]
+    mean = np.concatenate(every).mean(axis=0)
+    info, score = [], []
+    own = spectra[0].groups[0]
+    for flight, found, rest, kernels, x in zip(flights, spectra, left, filters, every,
+                                               strict=True):
+        effect = acting(flight.robot, flight.motion, x - mean, channels)
+        effect = effect.reshape(len(x), len(channels), -1)
+        small = spectrum(np.zeros(effect.shape[:2]), effect, flight.mask, flight.period,
+                         found.floor, flight.highest, spectra[0].groups, kernels)
+        count = found.counts[0]
+        root = np.linalg.inv(np.linalg.cholesky(found.noise[-1][np.ix_(own, own)]))
+        a = (root @ small.slopes[:, :count][:, :, own]).reshape(len(rest), -1, effect.shape[2])
+        b = (rest[:, :count][..., own] @ root.T).reshape(len(rest), -1)
+        info.append(a.transpose(0, 2, 1) @ a)
+        score.append((a.transpose(0, 2, 1) @ b[..., None])[..., 0])
+    blocks = list(zip(np.concatenate(info), np.concatenate(score), strict=True))
+    whole, right = (sum(part) for part in zip(*blocks, strict=True))
+    unit = np.eye(len(right))
+
+    def gains_with(size):
+        moved = [np.linalg.solve(whole - g + unit / size**2, right - h) for g, h in blocks]
+        return np.array([h @ w - w @ g @ w / 2 for (g, h), w in zip(blocks, moved, strict=True)])
+
+    gains = max((gains_with(size) for size in SIZES), key=lambda own: own.sum())
+    count, scatter = len(gains), np.std(gains, ddof=1) if len(gains) > 1 else np.inf
+    value = np.mean(gains) / scatter * np.sqrt(count)
+    return Unexplained('repeatable', float(student.sf(value, max(count - 1, 1))),
+                       float(np.sum(gains)), tuple(channels[c] for c in own))
+
+
+def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, ...]
+         ) -> Unexplained:
+    """
+    Test of a periodic force or torque.
+
+    Args:
+        spectra: of the flights.
+        left: (B, F, C) whitened residual of each flight after the fit.
+        channels: names of all channels.
+
+    """
+    own = spectra[0].groups[0]
+    count = min(rest.shape[1] for rest in left)
+    first = int(np.ceil(SLOWEST / spectra[0].step))
+    rest = np.concatenate([rest[:, first:count][..., own] for rest in left])**2
+    blocks, power = len(rest), rest.mean(axis=0)
+    # a slope of the spectrum is no line, so the larger of both sides counts
+    places = np.arange(NEAR, len(power) - NEAR)
+    ratio = np.array([power[k] / np.maximum(power[k - NEAR:k - 1].mean(axis=0),
+                                            power[k + 2:k + NEAR + 1].mean(axis=0))
+                      for k in places])
+    k, c = np.unravel_index(ratio.argmax(), ratio.shape)
+    sides = NEAR - 1
+    chance = float(f_law.sf(ratio[k, c], blocks, blocks * sides)) * ratio.size
+    order = np.argsort(-ratio[k])
+    frequency = (places[k] + first) * spectra[0].step
+    return Unexplained('line', min(chance, 1.0), float(blocks * (
+        ratio[k, c] - 1 - np.log(ratio[k, c])) / 2), tuple(channels[own[i]] for i in order[:2]),
+        float(frequency))
+
+
+def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
+    """
+    Both tests; the most improbable first.
+
+    Where an entry is excluded, the controller feeds noise back, and what repeats may be its
+    answer; nothing is tested then.
+    """
+    if solution.banned:
+        return []
+    left = left_of(engine, solution)
+    rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
+            line(solution.spectra, left, engine.channels)]
+    return sorted(rows, key=lambda row: row.probability)

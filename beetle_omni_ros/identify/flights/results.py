@@ -11,20 +11,18 @@ import numpy as np
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.flights.balance import Balance
 from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.evidence import Posterior
-from beetle_omni_ros.identify.flights.priors import Entry
+from beetle_omni_ros.identify.flights.evidence import log_prior, Posterior, Solution
+from beetle_omni_ros.identify.flights.keys import Entry, Key
+from beetle_omni_ros.identify.flights.page import summary
 from beetle_omni_ros.identify.flights.quality import (
     discrepancy_sizes,
     errors,
     fitted,
     noise_of,
+    Unexplained,
+    unexplained,
 )
-from beetle_omni_ros.identify.flights.solution import log_prior, Solution
-from beetle_omni_ros.identify.flights.text import summary
-from beetle_omni_ros.identify.flights.unexplained import Unexplained, unexplained
-from beetle_omni_ros.identify.gap.keys import Key
-from beetle_omni_ros.identify.gap.residual import UNITS
-from beetle_omni_ros.model.catalogue import separating_experiment
+from beetle_omni_ros.identify.flights.treatment import separating_experiment, TREATMENTS
 from beetle_omni_ros.model.effects import CATALOGUE
 
 ALPHA = 0.05            # probability of a false alarm that is accepted
@@ -34,6 +32,8 @@ TESTS = 2               # of what is unexplained; they share the accepted probab
 MOST_FED_BACK = 2       # entries that feedback may exclude; with more, the loop hides the robot
 FORM_DEVIATION = 0.1    # of a value: deviation by the error of form of its law
 LEAST_TIME = 1.0        # [s] in a regime, of which an RMS is stated
+UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate': 'rad/s',
+         'joint': 'rad'}
 Starts = dict[str, dict[str, float]]
 
 
@@ -44,7 +44,7 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
     Flights that do not show most of the catalogue decide nothing.
 
     Args:
-        verdict: a key of :data:`~beetle_omni_ros.identify.flights.text.WORDS`.
+        verdict: a key of :data:`~beetle_omni_ros.identify.flights.page.WORDS`.
         groups: each group of channels: ``used``, ``channels``, and ``reason`` if not.
         reason: why no effect is named, as the end of a sentence.
         more: further keys, and those that have another value than that of bad data.
@@ -66,7 +66,7 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
         result['next_experiment'] = separating_experiment(unclear[0])
     elif verdict == 'not_decidable' and result['hidden']:
         result['next_experiment'] = Counter(
-            CATALOGUE[name].excited_by for name in result['hidden']).most_common(1)[0][0]
+            TREATMENTS[name].excited_by for name in result['hidden']).most_common(1)[0][0]
     return result | {'summary': summary(result)}
 
 
@@ -84,7 +84,7 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
         judges: flights that the errors are about.
         groups: as of :func:`result_of`.
         held_out: whether the judges are other flights than the fitted ones.
-        starts: as of :class:`~beetle_omni_ros.identify.flights.bag.BagFlight`.
+        starts: as of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`.
         findings: sentences about the flights.
         slow: balance of torques; the mean of both e-values is one.
         measured: whether forces are those of an accelerometer. What an estimator makes of the

@@ -26,6 +26,23 @@ LEAST = 0.25         # share of a block that must count
 
 
 @dataclass(eq=False)
+class Linear:
+    """
+    A flight linearised at a point.
+
+    Attributes:
+        residual: (N, C) measured minus expected at the point.
+        slopes: (N, C, K) derivatives by the keys.
+        measured: (N, C) measurements.
+
+    """
+
+    residual: np.ndarray
+    slopes: np.ndarray
+    measured: np.ndarray
+
+
+@dataclass(eq=False)
 class Spectrum:
     """
     Cosine coefficients of one flight.
@@ -167,7 +184,7 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
 
     Args:
         residual: (N, C) measured minus expected.
-        slopes: (N, C, K) its derivatives.
+        slopes: (N, C, K) its derivatives; whitened in place, because a copy is 100 MB.
         mask: (N, C) samples that count.
         period: of the samples [s].
         floor: (C,) smallest standard deviation of a sample's noise.
@@ -184,7 +201,11 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
     highest = np.broadcast_to(highest, len(floor))
     used = frequency <= min(EDGES[-1], highest.max())
     coefficients = dct(residual[rows] * weight, axis=1, norm='ortho')[:, used]
-    derivatives = dct(slopes[rows] * weight[..., None], axis=1, norm='ortho')[:, used]
+    derivatives = np.zeros((len(rows), int(used.sum()), *slopes.shape[1:]))
+    for c, acting in enumerate((slopes != 0).any(axis=0)):
+        own = np.flatnonzero(acting)        # most keys act on few channels
+        derivatives[:, :, c, own] = dct(
+            slopes[:, c, own][rows] * weight[:, :, c, None], axis=1, norm='ortho')[:, used]
     band = np.searchsorted(EDGES, frequency[used], side='left')
     noise = np.tile(np.diag(floor.astype(float)**2), (len(EDGES), 1, 1))
     for k in np.unique(band):
@@ -202,7 +223,7 @@ def _whitened(residual, slopes, mask, filters, warm):
     Missing samples are interpolated in both, so that the linear model stays exact. What follows
     the begin or a long gap does not count.
     """
-    residual, slopes, mask = residual.copy(), slopes.copy(), mask.copy()
+    residual, mask = residual.copy(), mask.copy()
     t = np.arange(len(mask))
     for c in range(mask.shape[1]):
         there = np.flatnonzero(mask[:, c])

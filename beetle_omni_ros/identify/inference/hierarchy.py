@@ -18,7 +18,7 @@ from beetle_omni_ros.identify.inference.least_squares import (
     levenberg_marquardt,
     log_integral,
 )
-from beetle_omni_ros.identify.inference.robust import huber
+from beetle_omni_ros.identify.inference.noise import huber
 
 WIDTH = 1.96        # standard deviations of a 95 % interval
 STRETCHES = 8       # of time, whose scores scatter

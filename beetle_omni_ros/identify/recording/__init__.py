@@ -1,1 +1,1 @@
-"""A recording checked against itself: clocks, values, units and conventions."""
+"""Flights of bags and tables, read and checked against themselves: clocks, values, conventions."""

@@ -4,14 +4,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
-from beetle_omni_ros.identify.gap.series import low_pass
-from beetle_omni_ros.identify.recording.clocks import clock_damages, lag_damage
-from beetle_omni_ros.identify.recording.damage import changed, Damage
-from beetle_omni_ros.identify.recording.limits import shipped
-from beetle_omni_ros.identify.recording.readings import reading_damages, sensor_damages
-from beetle_omni_ros.identify.recording.relations import Mistake, mistakes, Relation, RELATIONS
-from beetle_omni_ros.identify.recording.signals import Signals, signals_of
+from beetle_omni_ros.identify.recording.bag import changed, Damage, NEEDED, Recording
+from beetle_omni_ros.identify.recording.parameters import shipped
+from beetle_omni_ros.identify.recording.relations import (
+    COMMAND,
+    Mistake,
+    mistakes,
+    Relation,
+    RELATIONS,
+    signals_of,
+    Smoothed,
+)
+from beetle_omni_ros.identify.recording.series import low_pass
+from beetle_omni_ros.identify.recording.topics import (
+    clock_damages,
+    lag_damage,
+    reading_damages,
+    sensor_damages,
+)
 from beetle_omni_ros.model.parameters import RobotParameters
 
 MOST_REPAIRS = 6        # successive; a repair can reveal another damage
@@ -133,7 +143,7 @@ class Comparison:
 
     """
 
-    def __init__(self, name: str, signals: Signals):
+    def __init__(self, name: str, signals: Smoothed):
         self.name, self.signals, self.limits = name, signals, (limits := shipped())
         period = float(np.diff(signals.t[:2])[0])
         self.kernel = low_pass(limits.edge, 2, period)
@@ -150,7 +160,7 @@ class Comparison:
         # A contradiction of thrusts may follow from another one.
         self.wrong = [name for name in wrong if RELATIONS[name].certain] or wrong
 
-    def _agreement(self, relation: Relation, signals: Signals) -> Agreement:
+    def _agreement(self, relation: Relation, signals: Smoothed) -> Agreement:
         late, early = (self.kernel(x)[:len(self.centres)][self.fine]
                        for x in relation.pair(signals))
         return Agreement(late, early, self.limits.noise**2 * sum(
@@ -177,7 +187,8 @@ class Comparison:
     def explained(self) -> list[Damage]:
         """The most likely mistake, if it resolves a contradiction and makes no other one."""
         tried = [self._with(mistake) for mistake in mistakes() if self._suspected(mistake)]
-        tried += [late for h in tried if (late := self._since(h))]
+        # A sensor can turn on the way; what a command means does not change during a flight.
+        tried += [late for h in tried if h.mistake.topic != COMMAND and (late := self._since(h))]
         best = max([self.usual, *tried], key=lambda h: h.score)
         if best.mistake is None or not any(
                 name in best.mistake.touches and not self._contradicts(name, best)

@@ -1,21 +1,129 @@
 """
-The checks as data: signals that must agree, and the mistakes that make them disagree.
+Smoothed readings on one grid, and the checks as data: signals that must agree, and mistakes.
 
-A mistake is a linear map of the columns of one topic, as a unit, an order, a sign or a rotation
-is. Its inverse undoes it, in the comparison and in a repair.
+A mistake makes signals disagree. It is a linear map of the columns of one topic, as a unit, an
+order, a sign or a rotation is. Its inverse undoes it, in the comparison and in a repair.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import permutations, product
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.identify.recording.damage import COMMAND, IMU, JOINTS, POSE
-from beetle_omni_ros.identify.recording.signals import GRAVITY, Signals
+from beetle_omni_ros.identify.recording.bag import COMMAND, IMU, JOINTS, POSE, Recording
+from beetle_omni_ros.identify.recording.parameters import shipped
+from beetle_omni_ros.identify.recording.series import aligned, low_pass, matrices
+from beetle_omni_ros.model.parameters import RobotParameters
+
+GRAVITY = 'gravity'     # [m/s^2] that the accelerometer measures
+THINNED = 4             # points of the fine grid for each point of the coarse one
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """
+    All topics of one flight on one grid, below three times the edge of the comparisons.
+
+    Attributes:
+        t: (N,) stamps [s].
+        data: topic -> (3, N, width) values and their first and second derivatives; ``GRAVITY``
+            -> (3, N, 1) gravity [m/s^2] that the accelerometer measures.
+        silent: (N,) whether a topic has a gap there.
+        noise: topic -> (width,) density of the white noise of its readings: variance times
+            period.
+        robot: its geometry.
+
+    """
+
+    t: np.ndarray
+    data: dict[str, np.ndarray]
+    silent: np.ndarray
+    noise: dict[str, np.ndarray]
+    robot: RobotParameters
+
+    def corrected(self, topic: str, undo: np.ndarray) -> 'Smoothed':
+        """The same with ``undo`` (width, width) applied to the values of one topic."""
+        return replace(self, data=self.data | {topic: self.data[topic] @ undo.T},
+                       noise=self.noise | {topic: undo**2 @ self.noise[topic]})
+
+    def turning(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rates (N, 3) [rad/s] by MoCap and gyroscope, body axes."""
+        q, change = self.data[POSE][:2, :, 3:]
+        v, w, dv, dw = q[:, :3], q[:, 3:], change[:, :3], change[:, 3:]
+        rate = 2 * (w * dv - dw * v - np.cross(v, dv)) / (q**2).sum(axis=1, keepdims=True)
+        return rate, self.data[IMU][0, :, 3:]
+
+    def pushing(self) -> tuple[np.ndarray, np.ndarray]:
+        """Accelerations (N, 3) [m/s^2] by MoCap and accelerometer, body axes."""
+        rotation = matrices(self.data[POSE][0, :, 3:])
+        seen = np.einsum('nij,ni->nj', rotation, self.data[POSE][2, :, :3])
+        return seen, self.data[IMU][0, :, :3] - self.data[GRAVITY][0] * rotation[:, 2]
+
+    def tilting(self) -> tuple[np.ndarray, np.ndarray]:
+        """Tilts (N, 4) [rad] by encoders and commands, without their means."""
+        read, told = self.data[JOINTS][0], self.data[COMMAND][0, :, :4]
+        return read - read.mean(axis=0), told - told.mean(axis=0)
+
+    def lifting(self) -> tuple[np.ndarray, np.ndarray]:
+        """Specific forces (N, 3) [m/s^2] by accelerometer and thrusts at the measured tilts."""
+        axes, tilt = self.robot.tilt_axes, self.data[JOINTS][0, :, :, None]
+        normals = np.cos(tilt) * [0, 0, 1] + np.sin(tilt) * np.cross(axes, [0.0, 0.0, 1.0])
+        force = np.einsum('ni,nij->nj', self.data[COMMAND][0, :, 4:], normals)
+        return self.data[IMU][0, :, :3], force / self.robot.mass
+
+
+def signals_of(recording: Recording, robot: RobotParameters) -> Smoothed | None:
+    """Smooth all topics with the same filter; None if they have too little time in common."""
+    limits = shipped()
+    series = {topic: series_of(recording, topic) for topic in (IMU, POSE, JOINTS, COMMAND)}
+    if min(len(t) for t, _ in series.values()) < 2:
+        return None
+    begin = max(t[0] for t, _ in series.values())
+    end = min(t[-1] for t, _ in series.values())
+    if not limits.window < end - begin < 1e5:
+        return None
+    kernel = low_pass(3 * limits.edge, THINNED, limits.period[1] / 10)
+    grid = begin + kernel.period * np.arange(int((end - begin) / kernel.period))
+    at = grid[kernel.centres(len(grid))]
+    data = {GRAVITY: np.full((3, len(at), 1), robot.gravity)}
+    noise, silent = {GRAVITY: np.zeros(1)}, np.zeros(len(at), dtype=bool)
+    for topic, (t, values) in series.items():
+        if topic == POSE:
+            norm = np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+            values = np.concatenate([values[:, :3], aligned(values[:, 3:] / norm)], axis=1)
+        even = np.stack([np.interp(grid, t, column) for column in values.T], axis=1)
+        if topic == COMMAND:
+            keep = np.exp(-kernel.period / robot.rotors.time_constant)
+            even[:, 4:] = lfilter([1 - keep], [1, -keep], even[:, 4:], axis=0,
+                                  zi=keep * even[:1, 4:])[0]
+        data[topic] = np.stack([kernel(even, order)[:len(at)] for order in range(3)])
+        for k in np.flatnonzero(np.diff(t) > limits.period[1]):
+            silent |= (at > t[k]) & (at < t[k + 1])
+        noise[topic] = white_noise(values)**2 * np.median(np.diff(t))
+    return Smoothed(at, data, silent, noise, robot)
+
+
+def series_of(recording: Recording, topic: str) -> tuple[np.ndarray, np.ndarray]:
+    """Ascending unique stamps (N,) and finite values (N, width)."""
+    t, values = recording.times[topic], recording.values[topic]
+    fine = np.isfinite(t) & np.isfinite(values).all(axis=1)
+    t, first = np.unique(t[fine], return_index=True)
+    return t, values[fine][first]
+
+
+def white_noise(values: np.ndarray) -> np.ndarray:
+    """
+    Standard deviation (width,) of the white noise of equidistant readings (N, width).
+
+    The third difference removes smooth motion. Its variance is 1 + 9 + 9 + 1 times that of white
+    noise, and its median absolute deviation is robust against single steps.
+    """
+    return 1.4826 / 20**0.5 * np.median(np.abs(np.diff(values, 3, axis=0)), axis=0)
 
 
 @dataclass(frozen=True)
@@ -38,7 +146,7 @@ class Relation:
     late: str
     early: str
     words: str
-    pair: Callable[[Signals], tuple[np.ndarray, np.ndarray]]
+    pair: Callable[[Smoothed], tuple[np.ndarray, np.ndarray]]
     noise: tuple[tuple[str, int, int], ...]
     gain: str
     lag: str = ''
@@ -46,13 +154,13 @@ class Relation:
 
 
 RELATIONS = {
-    'turning': Relation(POSE, IMU, 'rotation of the pose and gyroscope', Signals.turning,
+    'turning': Relation(POSE, IMU, 'rotation of the pose and gyroscope', Smoothed.turning,
                         ((IMU, 3, 0), (POSE, 3, 1)), 'gain', 'sensor_lag'),
-    'pushing': Relation(POSE, IMU, 'motion of the pose and accelerometer', Signals.pushing,
+    'pushing': Relation(POSE, IMU, 'motion of the pose and accelerometer', Smoothed.pushing,
                         ((IMU, 0, 0), (POSE, 0, 2)), 'gain'),
-    'tilting': Relation(JOINTS, COMMAND, 'encoders and tilt commands', Signals.tilting,
+    'tilting': Relation(JOINTS, COMMAND, 'encoders and tilt commands', Smoothed.tilting,
                         ((JOINTS, 0, 0),), 'gain', 'servo_lag'),
-    'lifting': Relation(IMU, COMMAND, 'accelerometer and thrust commands', Signals.lifting,
+    'lifting': Relation(IMU, COMMAND, 'accelerometer and thrust commands', Smoothed.lifting,
                         ((IMU, 0, 0),), 'thrust_gain', certain=False)}
 
 
@@ -67,7 +175,7 @@ class Mistake:
         text: cause in words.
         undo: (width, width) map from recorded to right columns.
         fix: description of the repair; empty without one.
-        part: key of the changed :class:`Signals`, if not ``topic``.
+        part: key of the changed :class:`Smoothed`, if not ``topic``.
 
     """
 

@@ -69,14 +69,14 @@ def chosen(columns: Sequence[str]) -> dict[str, tuple[str, float]]:
         ParameterError: another form than QUANTITY=[-]COLUMN[*FACTOR].
 
     """
-    found = {}
+    chosen_columns = {}
     for text in columns:
         match = re.fullmatch(r'(\w+)=(-?)([^*]+?)(?:\*(\d+\.?\d*|\.\d+))?', text)
         if not match or match[1] not in COLUMNS:
             raise ParameterError(f"--column {text}: expected QUANTITY=[-]COLUMN[*FACTOR] with "
                                  f"a quantity of {', '.join(COLUMNS)}, e.g. thrust=-fz")
-        found[match[1]] = match[3], float(match[2] + (match[4] or '1'))
-    return found
+        chosen_columns[match[1]] = match[3], float(match[2] + (match[4] or '1'))
+    return chosen_columns
 
 
 def read_rotor_log(path: str | Path, columns: Mapping[str, tuple[str, float]] | None = None,
@@ -127,16 +127,16 @@ def read_rotor_log(path: str | Path, columns: Mapping[str, tuple[str, float]] | 
 
 def _wanted(header, columns, source):
     for quantity, names in COLUMNS.items():
-        found = [(cell, factor) for cell in header for name, factor in names.items()
+        named = [(cell, factor) for cell in header for name, factor in names.items()
                  if re.fullmatch(rf'(rotor\d+_)?{name}', cell)]
         if quantity in columns:
-            found = [columns[quantity]]
-            if found[0][0] not in header:
-                raise LogError(f"column '{found[0][0]}' of --column is missing")
-        if len(found) > 1:
-            raise LogError(f"columns '{found[0][0]}' and '{found[1][0]}' mean the same; choose "
+            named = [columns[quantity]]
+            if named[0][0] not in header:
+                raise LogError(f"column '{named[0][0]}' of --column is missing")
+        if len(named) > 1:
+            raise LogError(f"columns '{named[0][0]}' and '{named[1][0]}' mean the same; choose "
                            f'one by --column {quantity}=COLUMN')
-        source.update({quantity: one for one in found})
+        source.update({quantity: one for one in named})
     if 'duty' not in source and 'target' not in source:
         raise missing('pwm_us', header)
     for quantity in ('thrust', 'torque') + ('voltage',) * ('duty' in source):

@@ -7,10 +7,9 @@ import matplotlib
 import numpy as np
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.rotor.lag import fit_lag
-from beetle_omni_ros.identify.rotor.log import RotorLog
-from beetle_omni_ros.identify.rotor.surface import (
+from beetle_omni_ros.identify.rotor.fits import (
     estimate,
+    fit_lag,
     fit_surface,
     map_rows,
     Rows,
@@ -18,10 +17,11 @@ from beetle_omni_ros.identify.rotor.surface import (
     temperature_drift,
     torque_ratio,
 )
+from beetle_omni_ros.identify.rotor.log import RotorLog
 from beetle_omni_ros.model.files import LogError
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.show.figures import FAINT, INK, legend, panels, STYLE, svg
-from beetle_omni_ros.show.page import Grid, page, section
+from beetle_omni_ros.show.page import Grid, section
 
 LEVELS = (0.25, 0.5, 0.75, 1.0)     # of the largest duty, for which the ratio is listed
 QUANTITIES = {'thrust': 'N', 'torque': 'N_m'}
@@ -99,22 +99,22 @@ def _surface(model, name):
 
 def grids(results: dict) -> list[Grid]:
     """Tables of the results."""
-    found, rows = [], []
+    tables, rows = [], []
     if surface := results['surface']:
         torque = results['torque']
-        found = [Grid('surfaces over u = duty (0 to 1) x voltage [V]',
-                      ['', 'terms', 'RMS', 'RMS of steps at a voltage left out'],
-                      [[name, ' + '.join(f'{one["value"]:.4g} {term}'
-                                         for term, one in part['terms'].items()),
-                        f'{part["rms_" + unit]:.3f}', f'{part["left_out_rms_" + unit]:.3f}']
-                       for name, part, unit in (('thrust [N]', surface, 'N'),
-                                                ('torque [N m]', torque, 'N_m'))]),
-                 Grid('duty [% of 2000 us] = c0 + c1 g + c2 g^2 + c3 g^3, g = thrust / 10 N',
-                      ['V', 'max N', 'c3', 'c2', 'c1', 'c0', 'RMS [N]', '95 % band [N]'],
-                      [[f'{p["voltage_V"]:.2f}', f'{p["thrust_max_N"]:.2f}',
-                        *(f'{p["coefficients"][f"c{k}"]["value"]:.4f}' for k in (3, 2, 1, 0)),
-                        f'{p["rms_N"]:.3f}', f'{p["thrust_half_width_N"]:.3f}']
-                       for p in results['plateaus']])]
+        tables = [Grid('surfaces over u = duty (0 to 1) x voltage [V]',
+                       ['', 'terms', 'RMS', 'RMS of steps at a voltage left out'],
+                       [[name, ' + '.join(f'{one["value"]:.4g} {term}'
+                                          for term, one in part['terms'].items()),
+                         f'{part["rms_" + unit]:.3f}', f'{part["left_out_rms_" + unit]:.3f}']
+                        for name, part, unit in (('thrust [N]', surface, 'N'),
+                                                 ('torque [N m]', torque, 'N_m'))]),
+                  Grid('duty [% of 2000 us] = c0 + c1 g + c2 g^2 + c3 g^3, g = thrust / 10 N',
+                       ['V', 'max N', 'c3', 'c2', 'c1', 'c0', 'RMS [N]', '95 % band [N]'],
+                       [[f'{p["voltage_V"]:.2f}', f'{p["thrust_max_N"]:.2f}',
+                         *(f'{p["coefficients"][f"c{k}"]["value"]:.4f}' for k in (3, 2, 1, 0)),
+                         f'{p["rms_N"]:.3f}', f'{p["thrust_half_width_N"]:.3f}']
+                        for p in results['plateaus']])]
         rows = [('torque to thrust ratio [m]', results['torque_to_thrust_ratio'], 1, 5),
                 *((f'  at {one["thrust_N"]:.1f} N', one, 1, 5) for one in torque['ratio_at']),
                 ('change of thrust [%/K]', results['temperature'], 100, 3)]
@@ -122,20 +122,13 @@ def grids(results: dict) -> list[Grid]:
         rows += [(f'{name} [ms], {lag["log"]}', one, 1000, 0)
                  for name, one in (('lag', lag), ('lag up', lag['up']), ('lag down', lag['down']),
                                    ('dead time', lag['dead_time']))]
-    return [*found, Grid('', ['', 'value', '95 %'], [
+    return [*tables, Grid('', ['', 'value', '95 %'], [
         [name, f'{unit * one["value"]:.{digits}f}',
          '..'.join(f'{unit * end:.{digits}f}' for end in one['interval'])]
         for name, one, unit, digits in rows if one and 'value' in one])]
 
 
-def rotor_page(model: RotorModel, robot: RobotParameters, results: dict) -> str:
-    """HTML page about an identification."""
-    notes = [f'verdict: {results["verdict"]}', *results['warnings']]
-    return page('Rotor', f'identified from {results["meta"]["log"]}', grids(results), notes,
-                rotor_sections(model, robot))
-
-
-def rotor_sections(model: RotorModel, robot: RobotParameters) -> list[str]:
+def sections(model: RotorModel, robot: RobotParameters) -> list[str]:
     """Sections with surfaces, residuals and lags."""
     with matplotlib.rc_context(STYLE):
         surfaces = [section(

@@ -2,30 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bags.bag import BagError, read_messages
-from beetle_omni_ros.identify.flights.text import summary
+from beetle_omni_ros.identify.flights.page import grids as flight_grids
+from beetle_omni_ros.identify.flights.page import head, summary
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.inference.hierarchy import WIDTH
 from beetle_omni_ros.identify.servo.fit import (
     decoded,
-    ENTRIES,
     error_rms,
-    Found,
     mask,
+    Search,
     select,
     Servos,
 )
-from beetle_omni_ros.identify.servo.joint import identify, joint_results
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
-from beetle_omni_ros.identify.servo.model import INDEX, NAMES, with_encoder_errors
-from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
+from beetle_omni_ros.identify.servo.model import (
+    catalogue_values,
+    ENTRIES,
+    file_sets,
+    INDEX,
+    NAMES,
+    own_delay,
+    with_encoder_errors,
+)
+from beetle_omni_ros.identify.servo.results import grids, identify, joint_results, sections
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.show.page import page
 
 ALPHA = 0.05        # probability of a wrong name, if each entry has the same prior probability
 AS_WELL = 1.3       # ratio of held-out errors of a corrected file and of the log's best model
@@ -35,14 +44,14 @@ CERTAIN = np.log(len(NAMED) / ALPHA)    # [nat] gain of evidence of a named entr
 
 
 def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: RobotParameters,
-                       base: Path | None) -> tuple[dict, Found]:
+                       base: Path | None) -> tuple[dict, Callable[[], str]]:
     """
     Compare the first log with a robot file, and further ones and those of ``holdout`` with it.
 
     ``base`` is the path of the robot file, for the record.
 
     Returns:
-        results with the keys of flights, and the identified servos.
+        results with the keys of flights, and a function that makes their HTML page.
 
     Raises:
         LogError: unusable log.
@@ -50,8 +59,8 @@ def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: Rob
     """
     log = read_joint_log(runs[0])
     others = [read_joint_log(path) for path in [*runs[1:], *holdout]]
-    found, apart = compare(log, robot), identify([log], robot)
-    result, joints = gap_of(found, apart, robot), joint_results(apart, others, robot)
+    search, apart = compare(log, robot), identify([log], robot)
+    result, joints = gap_of(search, apart, robot), joint_results(apart, others, robot)
     result['joints'], result['text'] = joints['joints'], joints['text']
     sets = any(len(effect['names']) > 1 for effect in result['effects'])
     result |= {'next_experiment': 'sine of 3.8 Hz and 0.25 rad for 10 s on the joints '
@@ -59,7 +68,14 @@ def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: Rob
         'meta': {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                  'robot': str(base) if base else 'params/robot.yaml', 'version': __version__}}
     result['summary'] = summary(result)
-    return result, apart
+
+    def made_page() -> str:
+        tables = [*flight_grids(result),
+                  *grids(result | {'meta': {'validate': [other.name for other in others]}})]
+        return page('Tilt servos', f'{log.name} against the robot file', tables, result['text'],
+                    sections(apart, others, robot), head(result))
+
+    return result, made_page
 
 
 def is_joint_log(path: Path) -> bool:
@@ -77,7 +93,7 @@ def is_joint_log(path: Path) -> bool:
     return recorded >= {'joint_states', 'command'}
 
 
-def compare(log: JointLog, robot: RobotParameters) -> Found:
+def compare(log: JointLog, robot: RobotParameters) -> Search:
     """
     The entries by which a log differs from the servos of a robot file as the simulator flies them.
 
@@ -88,26 +104,26 @@ def compare(log: JointLog, robot: RobotParameters) -> Found:
     return select(servos, (), NAMED, CERTAIN, named=True)
 
 
-def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
+def gap_of(search: Search, apart: Search, robot: RobotParameters) -> dict:
     """
     Verdict, effects and errors, with the keys of a gap of flights (`flights/results.py`).
 
     Args:
-        found: comparison with the robot file.
+        search: comparison with the robot file.
         apart: identification of the same log, whose error is the noise floor.
         robot: the robot file.
 
     """
-    log, units = found.servos.logs[0], range(len(found.servos.units))
+    log, units = search.servos.logs[0], range(len(search.servos.units))
     last = slice(log.end, None)
-    numbers = [number for *_, number in found.servos.units]
+    numbers = [number for *_, number in search.servos.units]
     before, after, floor = (
         np.array([error_rms(log, u, sets[u], part=last) for u in units])
-        for sets in (file_sets(robot, flown=True)[np.array(numbers) - 1], found.values(),
+        for sets in (file_sets(robot, flown=True)[np.array(numbers) - 1], search.values(),
                      apart.values()))
     floor = np.minimum(floor, after)
     allowed = np.hypot(AS_WELL * floor, log.quantum)
-    effects = _effects(found, robot)
+    effects = _effects(search, robot)
     explained = bool((after <= allowed).all())
     total = {key: float(np.sqrt(np.mean(values**2)))
              for key, values in (('before', before), ('after', after), ('floor', floor))}
@@ -126,7 +142,7 @@ def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
         'verdict': verdict, 'reason': reason, 'closure': closure, 'gap_before': ratio['before'],
         'gap_after': ratio['after'], 'noise_floor': 1.0,
         'effects': effects if explained else [], 'partial': [] if explained else effects,
-        'candidates': _candidates(found), 'hidden': [],
+        'candidates': _candidates(search), 'hidden': [],
         'where': sorted(({'channel': f'joint_{number}', 'regime': 'log',
                           'excess': float(before[u] / floor[u]),
                           'excess_after': float(after[u] / floor[u])}
@@ -134,75 +150,75 @@ def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
         'held_out': True, 'bad_data': [], 'findings': []}
 
 
-def _evidence(found, name):
+def _evidence(search, name):
     """Evidence of an entry: with the others of the selected model, against that model without."""
-    sign = 1 if name in found.chosen.entries else -1
-    on, off = found.chosen.fit, found.trials[name].fit
+    sign = 1 if name in search.chosen.entries else -1
+    on, off = search.chosen.fit, search.trials[name].fit
     held = sign * (on.held - off.held)
-    return {'delta_bic': 2 * found.gains[name],     # twice the logarithm of a Bayes factor
+    return {'delta_bic': 2 * search.gains[name],     # twice the logarithm of a Bayes factor
             'cv_gain': 2 * float(held.sum()), 'blocks_positive': int((held > 0).sum())}
 
 
-def _candidates(found):
+def _candidates(search):
     """One row for each entry with its evidence, largest gain first."""
-    return [{'name': name, 'accepted': name in found.chosen.entries,
-             'evidence': _evidence(found, name),
-             'reason': '' if name in found.chosen.entries else
-             'the evidence does not need it' if found.gains[name] < CERTAIN else
+    return [{'name': name, 'accepted': name in search.chosen.entries,
+             'evidence': _evidence(search, name),
+             'reason': '' if name in search.chosen.entries else
+             'the evidence does not need it' if search.gains[name] < CERTAIN else
              'less than an encoder count, or no better on left-out blocks'}
-            for name in sorted(found.gains, key=lambda name: -found.gains[name])]
+            for name in sorted(search.gains, key=lambda name: -search.gains[name])]
 
 
-def _effects(found, robot):
+def _effects(search, robot):
     """Accepted entries, largest gain first; a zero is an effect of each joint that it moves."""
     result = []
-    for name in sorted(found.chosen.entries, key=lambda name: -found.gains[name]):
-        rivals = _rivals(found, name)
-        effect = {'names': [name, *rivals], 'layer': 'joint', 'evidence': _evidence(found, name)}
+    for name in sorted(search.chosen.entries, key=lambda name: -search.gains[name]):
+        rivals = _rivals(search, name)
+        effect = {'names': [name, *rivals], 'layer': 'joint', 'evidence': _evidence(search, name)}
         if rivals:
-            effect['rivals'] = [{'name': rival, 'gain': found.gains.get(rival, 0.0),
-                                 'evidence': _evidence(found, rival),
-                                 'parameters': _parameters(found, found.trials[rival], rival,
+            effect['rivals'] = [{'name': rival, 'gain': search.gains.get(rival, 0.0),
+                                 'evidence': _evidence(search, rival),
+                                 'parameters': _parameters(search, search.trials[rival], rival,
                                                            robot)} for rival in rivals]
-        parts = _parameters(found, found.chosen, name, robot)
+        parts = _parameters(search, search.chosen, name, robot)
         if CATALOGUE[name].each != 'joint':
             result.append(effect | {'parameters': parts})
             continue
-        s = found.servos
-        moved = s.visible(found.chosen, found.trials[name]) & s.changed(found.chosen, name)
+        s = search.servos
+        moved = s.visible(search.chosen, search.trials[name]) & s.changed(search.chosen, name)
         for unit in np.flatnonzero(moved):
             number = s.units[unit][2]
             own = {key: {'value': entry['each'][str(number)], 'unit': entry['unit'],
                          'interval': entry['intervals'][str(number)],
                          'file': entry['files'][str(number)],
-                         'written': float(catalogue_values(found.values()[unit],
+                         'written': float(catalogue_values(search.values()[unit],
                                                            robot)[name][key])}
                    for key, entry in parts.items()}
             result.append(effect | {'joint': number, 'parameters': own})
     return result
 
 
-def _rivals(found, name):
+def _rivals(search, name):
     """Rejected entries that explain the log nearly as well in place of an accepted one."""
-    entries, s = found.chosen.entries, found.servos
+    entries, s = search.chosen.entries, search.servos
     rivals = {}
-    for other in (rival for rival in CATALOGUE[name].confused_with
-                  if rival in NAMED and rival not in entries and rival in found.trials):
+    for other in (rival for rival in TREATMENTS[name].confused_with
+                  if rival in NAMED and rival not in entries and rival in search.trials):
         swapped = s.fit([*(e for e in entries if e != name), other],
-                        starts=(found.trials[other], found.full), still=found.chosen.still)
-        if swapped.fit.evidence > found.chosen.fit.evidence - CERTAIN:
+                        starts=(search.trials[other], search.full), still=search.chosen.still)
+        if swapped.fit.evidence > search.chosen.fit.evidence - CERTAIN:
             rivals[other] = swapped.fit.evidence
-            found.trials[other] = swapped
+            search.trials[other] = swapped
     return sorted(rivals, key=lambda other: -rivals[other])
 
 
-def _parameters(found, trial, name, robot):
+def _parameters(search, trial, name, robot):
     """Parameter -> value (median joint), unit, 95 % interval, value in the file, each joint's."""
-    s, spec, joined = found.servos, CATALOGUE[name].parameters, {}
+    s, spec, joined = search.servos, CATALOGUE[name].parameters, {}
     file = file_sets(robot, flown=True)
     # An entry that the log neither needs nor excludes widens the intervals of the others.
-    possible = [trial, *(found.trials[other] for other, gain in found.gains.items()
-                         if trial is found.chosen and other not in trial.entries
+    possible = [trial, *(search.trials[other] for other, gain in search.gains.items()
+                         if trial is search.chosen and other not in trial.entries
                          and gain > -CERTAIN)]
     for parameter in spec:
         each, ends, files = {}, {}, {}

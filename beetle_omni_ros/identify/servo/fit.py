@@ -15,17 +15,17 @@ from scipy.cluster.vq import kmeans2
 from scipy.stats import chi2
 
 from beetle_omni_ros.identify.inference.hierarchy import design, Fit, solve
-from beetle_omni_ros.identify.inference.noise import Drifting, drifting
-from beetle_omni_ros.identify.inference.robust import HUBER, scale_of
+from beetle_omni_ros.identify.inference.noise import Drifting, drifting, HUBER, scale_of
 from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.identify.servo.model import (
+    ENTRIES,
     INDEX,
+    LIMITS,
     NAMES,
     READING_ERRORS,
     simulate,
     TERMS,
 )
-from beetle_omni_ros.identify.servo.robot import ENTRIES, LIMITS
 from beetle_omni_ros.model.effects import CATALOGUE
 
 LOGARITHMIC = np.array([term.logarithmic for term in TERMS.values()])
@@ -84,7 +84,7 @@ def kinds_of_motion(parts: Sequence[tuple], count: int) -> list[np.ndarray]:
 
 
 @dataclass(frozen=True)
-class Trial:
+class ServoModel:
     """A model: the entries that may differ from the base, except at some units, and their fit."""
 
     entries: tuple[str, ...]
@@ -124,8 +124,10 @@ class Servos:
                                 KINDS)
         self.blocks = [kind + KINDS * k for kind, (k, *_) in zip(kinds, self.units,
                                                                     strict=True)]
-        # Each log is predicted from the others, or each kind of motion of one or two logs.
-        self.folds = np.arange(KINDS * len(logs)) // (KINDS if len(logs) > 2 else 1)
+        # Each log is predicted from the others, or each kind of motion of one or two logs. A log
+        # need not show every kind.
+        self.folds = np.arange(1 + max(block.max() for block in self.blocks)) // (
+            KINDS if len(logs) > 2 else 1)
 
     # ---- model of the core
     def __call__(self, theta: np.ndarray, active: np.ndarray):
@@ -161,7 +163,7 @@ class Servos:
         return read[0], change
 
     # ---- fits
-    def estimate_noise(self, entries: Sequence[str], start=()) -> Trial:
+    def estimate_noise(self, entries: Sequence[str], start=()) -> ServoModel:
         """
         Measure the noise around a model; call it before :meth:`fit`.
 
@@ -186,7 +188,7 @@ class Servos:
         return self.fit(entries, starts=(trial,))
 
     def fit(self, entries: Sequence[str], starts: Sequence = (),
-            still: np.ndarray | None = None) -> Trial:
+            still: np.ndarray | None = None) -> ServoModel:
         """
         Fit the terms of some entries; the others have their base values.
 
@@ -204,7 +206,7 @@ class Servos:
         fits = []
         for start in starts or STARTS:
             target = self.base.copy()
-            if isinstance(start, Trial):
+            if isinstance(start, ServoModel):
                 target[:, active] = start.fit.theta[:, active]
             else:
                 limits = [log.reached() for log in self._parts]
@@ -215,9 +217,10 @@ class Servos:
                         target[:, p] = np.log(value) if LOGARITHMIC[p] else value
             x = self._nearest(s, target)
             fits.append(solve(self, self.base, s, x, self.blocks, self.low, HIGH, self.folds))
-        return Trial(tuple(entries), min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x), still)
+        best = min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x)
+        return ServoModel(tuple(entries), best, still)
 
-    def visible(self, one: Trial, other: Trial) -> np.ndarray:
+    def visible(self, one: ServoModel, other: ServoModel) -> np.ndarray:
         """
         (U,) whether two fits differ in the readings of a unit by an encoder count (RMS).
 
@@ -230,7 +233,7 @@ class Servos:
                          for a, b, sigma, (k, *_) in zip(*reads, self.sigma, self.units,
                                                          strict=True)])
 
-    def changed(self, trial: Trial, entry: str) -> np.ndarray:
+    def changed(self, trial: ServoModel, entry: str) -> np.ndarray:
         """(U,) whether a unit differs from the base by an entry, by a Wald test at 5 %."""
         terms = mask([entry])
         off = (trial.fit.theta - self.base)[:, terms]
@@ -239,7 +242,7 @@ class Servos:
                          for o, c in zip(off, spread, strict=True)])
         return size > chi2.isf(0.05 / len(off), terms.sum())
 
-    def determined(self, trial: Trial, entry: str) -> bool:
+    def determined(self, trial: ServoModel, entry: str) -> bool:
         """Whether the logs halve the variance of every combination of an entry's terms."""
         s, terms = trial.fit.s, mask([entry])
         prior, left = (each[:, terms][:, :, terms]
@@ -268,9 +271,9 @@ class Servos:
 
 
 @dataclass(frozen=True)
-class Found:
+class Search:
     """
-    The selected model of some logs.
+    Result of the search for the terms that some logs need.
 
     Attributes:
         servos: the logs with their noise.
@@ -282,18 +285,18 @@ class Found:
     """
 
     servos: Servos
-    full: Trial
-    chosen: Trial
-    trials: dict[str, Trial]
+    full: ServoModel
+    chosen: ServoModel
+    trials: dict[str, ServoModel]
     gains: dict[str, float]
 
-    def values(self, trial: Trial | None = None) -> np.ndarray:
+    def values(self, trial: ServoModel | None = None) -> np.ndarray:
         """(U, P) parameter sets of the units."""
         return decoded((trial or self.chosen).fit.theta)
 
 
 def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least: float = 0.0,
-           named: bool = False) -> Found:
+           named: bool = False) -> Search:
     """
     Add the entries that raise the evidence, largest gain first, and remove those that do not.
 
@@ -351,7 +354,7 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
                         for name in rejected}
     gains = {name: (gain(chosen) - gain(trial)) * (1 if name in chosen.entries else -1)
              for name, trial in trials.items()}
-    return Found(servos, full, chosen, trials, gains)
+    return Search(servos, full, chosen, trials, gains)
 
 
 def error_rms(log: JointLog, joint: int, values: np.ndarray, held: bool = True,
@@ -360,4 +363,9 @@ def error_rms(log: JointLog, joint: int, values: np.ndarray, held: bool = True,
     rows = np.arange(len(log.t))[part]
     rows = rows[log.fresh[rows]]
     error = simulate(log, joint, values[None], held)[0] - log.measured[joint]
-    return float(np.sqrt(np.mean(error[rows]**2)))
+    return rms(error[rows])
+
+
+def rms(values: np.ndarray) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))

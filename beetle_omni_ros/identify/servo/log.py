@@ -292,13 +292,13 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         log = read_bag(path)
     except (BagError, OSError) as error:
         raise LogError(str(error)) from None
-    for name, count in (('joint_states', len(log.joint_t)), ('command', len(log.command_t))):
+    for name, count in (('joint_states', len(log.joint.t)), ('command', len(log.command.t))):
         if not count:
             raise LogError(f'{path}: no {name} in this bag')
-    order = np.argsort(log.command_received, kind='stable')
-    received, tilt = log.command_received[order], log.command_tilt[order]
-    fresh = np.r_[True, np.diff(log.joint_t) > 0]
-    t, position = log.joint_t[fresh], log.joint_position[fresh]
+    order = np.argsort(log.command.received, kind='stable')
+    received, tilt = log.command.received[order], log.command.tilt[order]
+    fresh = np.r_[True, np.diff(log.joint.t) > 0]
+    t, position = log.joint.t[fresh], log.joint.position[fresh]
     last = np.searchsorted(received, t, side='right') - 1
     driven = (last >= 0) & (t - received[np.maximum(last, 0)] <= LAST_COMMAND)
     edges = np.flatnonzero(np.diff(np.r_[False, driven, False].astype(int)))

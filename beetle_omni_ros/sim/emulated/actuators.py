@@ -11,7 +11,7 @@ import numpy as np
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
-from beetle_omni_ros.sim.faults import Drive
+from beetle_omni_ros.sim.fault_kinds import Drive
 from beetle_omni_ros.sim.sensors import Frame
 from beetle_omni_ros.sim.simulator import ROUNDING, Simulator
 

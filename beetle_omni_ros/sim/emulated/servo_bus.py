@@ -45,7 +45,7 @@ NONE, RESULT_FAIL, INSTRUCTION, DATA_RANGE, ACCESS, ALERT = 0, 1, 2, 4, 7, 0x80
 PAUSE = 0.05        # [s] silence after which an incomplete packet is dropped
 
 
-class Register(NamedTuple):
+class EmulatedRegister(NamedTuple):
     """A register: address, size [B], value after power-up, values that may be written, sign."""
 
     address: int
@@ -57,39 +57,39 @@ class Register(NamedTuple):
 
 GAIN = range(16384)
 TABLE = {
-    'Model Number': Register(0, 2, 1210),
-    'Firmware Version': Register(6, 1, 52),
-    'ID': Register(7, 1, 1, range(253)),
-    'Return Delay Time': Register(9, 1, 250, range(255)),
-    'Drive Mode': Register(10, 1, 0, (0, 1, 4, 5, 8, 9, 12, 13)),
-    'Operating Mode': Register(11, 1, 3, (0, 1, 3, 4, 5, 16)),
-    'Secondary(Shadow) ID': Register(12, 1, 255, (*range(253), 255)),
-    'Homing Offset': Register(20, 4, 0, range(-1_044_479, 1_044_480), True),
-    'Temperature Limit': Register(31, 1, 70, range(101)),
-    'Current Limit': Register(38, 2, 910, range(911)),
-    'Startup Configuration': Register(60, 1, 0, range(4)),
-    'Shutdown': Register(63, 1, 52, range(0x3E)),
-    'Torque Enable': Register(64, 1, 0, range(2)),
-    'LED': Register(65, 1, 0, range(2)),
-    'Status Return Level': Register(68, 1, 2, range(3)),
-    'Registered Instruction': Register(69, 1),
-    'Hardware Error Status': Register(70, 1),
-    'Velocity I Gain': Register(76, 2, 1200, GAIN),
-    'Position D Gain': Register(80, 2, 0, GAIN),
-    'Position I Gain': Register(82, 2, 0, GAIN),
-    'Position P Gain': Register(84, 2, 900, GAIN),
-    'Feedforward 2nd Gain': Register(88, 2, 0, GAIN),
-    'Feedforward 1st Gain': Register(90, 2, 0, GAIN),
-    'Bus Watchdog': Register(98, 1, 0, range(128)),
-    'Profile Acceleration': Register(108, 4, 0, range(32768)),
-    'Profile Velocity': Register(112, 4, 0, range(32768)),
-    'Goal Position': Register(116, 4, 0, range(-1_048_575, 1_048_576), True),
-    'Present Current': Register(126, 2, signed=True),
-    'Present Velocity': Register(128, 4, signed=True),
-    'Present Position': Register(132, 4, signed=True),
-    'Present Input Voltage': Register(144, 2, 120),
-    'Present Temperature': Register(146, 1, 35),
-    'Backup Ready': Register(147, 1),
+    'Model Number': EmulatedRegister(0, 2, 1210),
+    'Firmware Version': EmulatedRegister(6, 1, 52),
+    'ID': EmulatedRegister(7, 1, 1, range(253)),
+    'Return Delay Time': EmulatedRegister(9, 1, 250, range(255)),
+    'Drive Mode': EmulatedRegister(10, 1, 0, (0, 1, 4, 5, 8, 9, 12, 13)),
+    'Operating Mode': EmulatedRegister(11, 1, 3, (0, 1, 3, 4, 5, 16)),
+    'Secondary(Shadow) ID': EmulatedRegister(12, 1, 255, (*range(253), 255)),
+    'Homing Offset': EmulatedRegister(20, 4, 0, range(-1_044_479, 1_044_480), True),
+    'Temperature Limit': EmulatedRegister(31, 1, 70, range(101)),
+    'Current Limit': EmulatedRegister(38, 2, 910, range(911)),
+    'Startup Configuration': EmulatedRegister(60, 1, 0, range(4)),
+    'Shutdown': EmulatedRegister(63, 1, 52, range(0x3E)),
+    'Torque Enable': EmulatedRegister(64, 1, 0, range(2)),
+    'LED': EmulatedRegister(65, 1, 0, range(2)),
+    'Status Return Level': EmulatedRegister(68, 1, 2, range(3)),
+    'Registered Instruction': EmulatedRegister(69, 1),
+    'Hardware Error Status': EmulatedRegister(70, 1),
+    'Velocity I Gain': EmulatedRegister(76, 2, 1200, GAIN),
+    'Position D Gain': EmulatedRegister(80, 2, 0, GAIN),
+    'Position I Gain': EmulatedRegister(82, 2, 0, GAIN),
+    'Position P Gain': EmulatedRegister(84, 2, 900, GAIN),
+    'Feedforward 2nd Gain': EmulatedRegister(88, 2, 0, GAIN),
+    'Feedforward 1st Gain': EmulatedRegister(90, 2, 0, GAIN),
+    'Bus Watchdog': EmulatedRegister(98, 1, 0, range(128)),
+    'Profile Acceleration': EmulatedRegister(108, 4, 0, range(32768)),
+    'Profile Velocity': EmulatedRegister(112, 4, 0, range(32768)),
+    'Goal Position': EmulatedRegister(116, 4, 0, range(-1_048_575, 1_048_576), True),
+    'Present Current': EmulatedRegister(126, 2, signed=True),
+    'Present Velocity': EmulatedRegister(128, 4, signed=True),
+    'Present Position': EmulatedRegister(132, 4, signed=True),
+    'Present Input Voltage': EmulatedRegister(144, 2, 120),
+    'Present Temperature': EmulatedRegister(146, 1, 35),
+    'Backup Ready': EmulatedRegister(147, 1),
 }
 NAMES = {register.address: name for name, register in TABLE.items()}
 DEFINED = frozenset(address for register in TABLE.values()

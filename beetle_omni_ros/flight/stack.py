@@ -1,0 +1,274 @@
+"""The flight stack as components: estimator, controllers and supervisor."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+import math
+import secrets
+
+import numpy as np
+
+from beetle_omni_ros.bags.messages import MessageError
+from beetle_omni_ros.bags.topics import TARGETS
+from beetle_omni_ros.control.base import Controller, ControllerHost, guidance_of, PoseTarget, State
+from beetle_omni_ros.control.hover import HoverController
+from beetle_omni_ros.control.targets import TargetChecks
+from beetle_omni_ros.estimation.ekf import ErrorStateEkf
+from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.flight.component import Component, ERROR, IDENTITY, OK, WARN
+from beetle_omni_ros.model.mode import FALLBACK, FLYING, STOPPED
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.supervisor.interface import Answer, Event, INFO, SupervisorParameters
+from beetle_omni_ros.supervisor.interface import ERROR as SEVERE
+from beetle_omni_ros.supervisor.supervisor import Supervisor
+
+# --- estimator -----------------------------------------------------------------------------------
+
+SENSOR_AGE = 0.2        # [s] an older sample is of a stuck driver or another clock
+PUBLISHED = ('tracking', 'dead_reckoning')      # a lost estimate is missed by its readers
+
+
+class Estimator(Component):
+    """Publishes odom for every IMU sample, corrected by MoCap poses at their capture time."""
+
+    def __init__(self, parameters: EkfParameters, robot: RobotParameters):
+        super().__init__('ekf_node')
+        self.ekf = ErrorStateEkf(parameters.of_robot(robot), robot.gravity)
+        self._status = self.ekf.status
+        self.writes('odom')
+        self.reads('imu/data_raw', self._on_imu, max_age=SENSOR_AGE)
+        self.reads('mocap/pose', partial(self.timed, self.ekf.pose), max_age=SENSOR_AGE)
+        self.track_compute(1 / parameters.imu.rate)
+        self.report('estimator', self._estimator_status)
+
+    def _on_imu(self, sample):
+        accepted = self.timed(self.ekf.imu, sample)
+        status = self.ekf.status
+        if status != self._status:
+            self.host.log(INFO, f'{self._status} -> {status}')
+            self._status = status
+        if accepted and status in PUBLISHED:
+            self.send('odom', self.ekf.estimate)
+
+    def _estimator_status(self):
+        level = {'tracking': OK, 'dead_reckoning': WARN, 'lost': ERROR}
+        values = {f'rejected: {reason}': count for reason, count in self.ekf.rejected.items()}
+        return level.get(self._status, OK), self._status, values
+
+
+# --- controllers ---------------------------------------------------------------------------------
+
+ODOM_AGE = 0.05         # [s] no command answers an older estimate
+JOINT_AGE = 0.1         # [s]
+REPEAT = 1.0            # [s] between two log lines about a controller
+STEP_TOLERANCE = 0.0025     # [s] half of the smallest interval between estimates
+CANNOT_BE_FLOWN = 'cannot be flown'     # kind of a refused target
+
+
+class ControllerComponent(Component):
+    """Steps a controller once a period, triggered by the estimate; see ControllerHost."""
+
+    def __init__(self, name: str, controller: Controller, robot: RobotParameters):
+        super().__init__(f'{name}_node')
+        self.stepper = ControllerHost(name, controller, self.took, self._on_error)
+        self._command_topic = f'{name}/command'
+        self._checks, self._sensors = TargetChecks(robot), robot.sensors
+        self._joints = self._command = None
+        self._last_step, self._quiet_until = -math.inf, -math.inf
+        self._reported_errors = 0
+        self.writes(self._command_topic)
+        self.reads('odom', self._on_odom, max_age=ODOM_AGE)
+        self.reads('joint_states', self._on_joints, max_age=JOINT_AGE)
+        self.reads('command', partial(setattr, self, '_command'), expected=False)
+        for topic in TARGETS:
+            self.reads(topic, self._on_target, expected=False)
+        self.follows('supervisor/state', self._on_mode)
+        self.follows('supervisor/target', partial(setattr, self.stepper, 'override'))
+        self.follows('supervisor/actuators', self.stepper.on_health)
+        self.track_compute(controller.period)
+        self.report('controller', self._controller_status)
+
+    def _on_error(self, text):
+        if self.host.elapsed() >= self._quiet_until:
+            self._quiet_until = self.host.elapsed() + REPEAT
+            self.host.log(SEVERE, text)
+
+    def _on_joints(self, joints):
+        if not np.isnan(joints.position).any():     # a bridge has lost a servo for the moment
+            self._joints = joints.corrected(self._sensors)
+
+    def _check_target(self, target, published):
+        # The age counts at publication: a latched target stays valid for a node that starts
+        # later. Publication times are system time, so simulated stamps have no age.
+        then = None if self.host.simulated or math.isnan(published) else published
+        reason = self._checks.why_not(target, then) or (
+            self.stepper.too_far(target, self.host.now()) if self.stepper.active else '')
+        if reason:
+            raise MessageError(reason, CANNOT_BE_FLOWN)
+
+    def _on_target(self, target, published):
+        self._check_target(target, published)
+        now = self.host.now()
+        if target.stamp == 0.0:     # `ros2 topic pub` sets no stamp: valid from now on
+            target = replace(target, stamp=now, **(
+                {} if isinstance(target, PoseTarget) else {'times': target.times + now}))
+        elif target.stamp > now:    # a clock that is ahead must not make it outlast later targets
+            target = replace(target, stamp=now)
+        # Latched and volatile copies may overtake each other: the newest stamp counts, except
+        # after the clock was set back.
+        old = self.stepper.target
+        if old is None or not target.stamp < old.stamp <= now:
+            self.stepper.target = target
+
+    def _on_mode(self, mode):
+        if mode.motors_off:
+            self._command = None
+        if reason := self.stepper.on_mode(mode, self.host.now()):
+            self.reject('target_pose', f'{reason}; the present pose is held', CANNOT_BE_FLOWN)
+
+    def _on_odom(self, odom):
+        stepper = self.stepper
+        stepper.on_estimate(odom)
+        since = odom.stamp - self._last_step        # < 0: the clock was set back
+        if self._joints is None or 0 <= since < stepper.controller.period - STEP_TOLERANCE:
+            return
+        self._last_step = odom.stamp
+        command = stepper.step(State.join(odom, self._joints, self._command))
+        if command is not None:
+            self.send(self._command_topic, command)
+
+    def _controller_status(self):
+        stepper, controller = self.stepper, self.stepper.controller
+        report = stepper.call('diagnostics') or {}
+        new, self._reported_errors = stepper.errors - self._reported_errors, stepper.errors
+        values = {**report, 'guidance': guidance_of(controller)}
+        if stepper.errors:
+            values['errors'] = stepper.errors
+        if new:
+            return ERROR, stepper.error, values
+        return OK, getattr(controller, 'name', self.name.removesuffix('_node')), values
+
+
+# --- supervisor ----------------------------------------------------------------------------------
+
+# [s] between checks while nothing triggers a step, and without a trigger until they begin. The
+# triggers are commands in flight, otherwise estimates: steps do not depend on a timer's phase.
+WATCH_PERIOD, WATCH_AFTER = 0.01, 0.015
+REQUESTS = ('arm', 'disarm', 'land', 'emergency_stop')
+BRIDGES = ('joint', 'rotor')
+
+
+class SupervisorComponent(Component):
+    """
+    Publishes command, the only topic that actuators execute, and supervisor/state (latched).
+
+    Services ~/arm, ~/disarm, ~/land and ~/emergency_stop; :meth:`select` selects the active
+    controller, also in flight. ``on_event`` gets each event.
+    """
+
+    def __init__(self, parameters: SupervisorParameters, robot: RobotParameters,
+                 controllers: Sequence[str], on_event: Callable[[Event], None] | None = None):
+        super().__init__('supervisor_node')
+        self._sensors, self._on_event = robot.sensors, on_event
+        self.supervisor = supervisor = Supervisor(parameters, robot, HoverController(robot),
+                                                  controllers)
+        self._joints = None
+        self._sent = (None, '')     # stamp and source of the last command
+        self._triggered = -math.inf     # time of the last step by a message [s]
+        self._identity_sent = f'supervisor_node:{secrets.token_hex(4)}'     # of this run
+        self.writes('command', IDENTITY, 'supervisor/state', 'supervisor/target',
+                    'supervisor/actuators')
+        self.reads('odom', self._on_odom)
+        self.reads('joint_states', self._on_joints, max_age=SENSOR_AGE)
+        self.reads('imu/data_raw', lambda s: supervisor.inputs.on_imu(
+            s.stamp, s.specific_force, s.angular_velocity), max_age=SENSOR_AGE)
+        self.reads('mocap/pose', lambda s: supervisor.inputs.on_mocap(
+            s.stamp, s.position, s.quaternion), max_age=SENSOR_AGE)
+        self.reads('rotor_states', lambda r: supervisor.inputs.on_rotors(r.stamp, r.speed),
+                   expected=False)
+        self.reads('battery_state', lambda battery: supervisor.inputs.on_battery(battery.voltage))
+        for name in controllers:
+            self.reads(f'{name}/command', partial(self._on_command, name), expected=False)
+        for name in BRIDGES:
+            self.follows(f'{name}_bridge/state', partial(self._on_bridge, name))
+        for name in REQUESTS:
+            self.services[name] = partial(self.request, name)
+        self.report('supervisor', self._supervisor_status)
+        self.every(WATCH_PERIOD, self._watch)
+
+    def start(self) -> None:
+        """Publish identity and state."""
+        self.send(IDENTITY, self._identity_sent)
+        self.step()
+
+    def select(self, controller: str) -> Answer:
+        """Select another controller."""
+        answer = self.supervisor.select(controller, self.host.now())
+        self._publish_states()
+        return answer
+
+    def request(self, name: str) -> Answer:
+        """Answer one of REQUESTS."""
+        answer = getattr(self.supervisor, name)(self.host.now())
+        self.step()
+        return answer
+
+    def _on_joints(self, joints):
+        joints = joints.corrected(self._sensors)
+        if not np.isnan(joints.position).any():
+            self._joints = joints
+        self.supervisor.inputs.on_joints(joints.stamp, joints.position, joints.velocity)
+
+    def _on_odom(self, odom):
+        if self._joints is None:
+            return
+        now = self.host.now()
+        self.supervisor.inputs.on_state(State.join(odom, self._joints), now)
+        if self.supervisor.state != FLYING:     # the fallback controller answers each estimate
+            self._triggered = now
+            self.step()
+
+    def _watch(self):
+        if not 0 <= self.host.now() - self._triggered < WATCH_AFTER:
+            self.step()
+
+    def _on_command(self, name, command):
+        supervisor, now = self.supervisor, self.host.now()
+        accepted = supervisor.inputs.on_command(name, command, now)
+        if accepted and name == supervisor.active and supervisor.state == FLYING:
+            self._triggered = now
+            self.step()
+
+    def _on_bridge(self, name, text):
+        self.supervisor.inputs.on_actuators(name, text, self.host.now())
+        self.step()
+
+    def step(self) -> None:
+        """Publish the command, if it is a new one, and changed states."""
+        supervisor = self.supervisor
+        command = supervisor.update(self.host.now())
+        # A command is not repeated: the actuators detect missing commands by the age.
+        if command is not None and (command.stamp, supervisor.source) != self._sent:
+            self._sent = (command.stamp, supervisor.source)
+            self.send('command', command, self._identity_sent)
+        self._publish_states()
+
+    def _publish_states(self):
+        supervisor = self.supervisor
+        self.update('supervisor/state', supervisor.mode)
+        self.update('supervisor/target', supervisor.target_override)
+        self.update('supervisor/actuators', supervisor.inputs.health)
+        for event in supervisor.inputs.events:
+            self.host.log(event.severity, event.text)
+            if self._on_event:
+                self._on_event(event)
+        supervisor.inputs.events.clear()
+
+    def _supervisor_status(self):
+        supervisor = self.supervisor
+        level = {FALLBACK: WARN, STOPPED: ERROR}.get(
+            supervisor.state, WARN if supervisor.faults else OK)
+        named = ', '.join(supervisor.faults)
+        state = self.newest['supervisor/state']
+        return level, f'{state}; faults: {named}' if named else state, \
+            supervisor.diagnostics()

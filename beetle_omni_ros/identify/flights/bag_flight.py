@@ -1,0 +1,388 @@
+"""
+Residuals of a flight that was recorded as a bag, with their slopes.
+
+It has four groups of channels on one grid. Each group has measured inputs, so that errors do not
+propagate:
+
+- B, force and torque: specific force and angular acceleration minus the body equations at the
+  measured tilts,
+- A, acceleration: of MoCap minus that of the IMU; independent of the robot's model,
+- W, rate: of MoCap minus gyroscope; independent of the robot's model,
+- J, joint: encoders minus servos that are simulated from the commands.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.identify.flights.body import BodyModel
+from beetle_omni_ros.identify.flights.keys import delays_of, Key
+from beetle_omni_ros.identify.flights.servo import (
+    module_load,
+    simulate,
+    undescribed_load,
+    Windows,
+)
+from beetle_omni_ros.identify.flights.signals import Signals
+from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
+from beetle_omni_ros.identify.recording.bag import COMMAND, Recording
+from beetle_omni_ros.identify.recording.parameters import GapParameters
+from beetle_omni_ros.identify.recording.series import low_pass, matrices, THIN, within
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.servo import NUMPY, Servo
+
+CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torque_z'),
+            'A': ('acceleration_x', 'acceleration_y', 'acceleration_z'),
+            'W': ('rate_x', 'rate_y', 'rate_z'),
+            'J': ('joint_1', 'joint_2', 'joint_3', 'joint_4')}
+PLACE = {'B': slice(0, 6), 'A': slice(6, 9), 'W': slice(9, 12), 'J': slice(12, 16)}
+# Time shift of an encoder reading, and of a pose of MoCap, for each second of delay of a sensor.
+SHIFTS = dict.fromkeys(delays_of('imu'), -1.0) | dict.fromkeys(delays_of('encoders'), 1.0)
+POSE_SHIFTS = dict.fromkeys(delays_of('imu'), -1.0) | dict.fromkeys(delays_of('mocap'), 1.0)
+# Parameters with central differences. With one-sided ones, slopes of equivalent delays differ by
+# the second derivative, and a linear fit exploits the difference.
+BOTH_SIDES = 'delay'
+LEAST = 0.1             # smallest share of a start to which its keys may fall in one step
+WIDEST = 16.0           # [Hz] low-pass edge of joint angles, of which every second one counts
+POSES = 8.0             # [Hz] the same of MoCap, whose noise grows with the square of frequency
+# [Hz] largest frequency of each group: above 8 Hz the filters of readings and tilts differ, and a
+# fit takes the difference for a larger mass of the tilting modules
+FASTEST = {'B': 8.0, 'A': POSES, 'W': POSES, 'J': WIDEST}
+
+
+class BagFlight:
+    """
+    Signals, body equations and servos of one flight; all flights share the body equations.
+
+    Attributes:
+        modules: share of the file's tilting modules in the model, 0 or 1; fits vary it around
+            that.
+        trusted: (N,) whether a grid point is away from the ground and from the rotor limits.
+        period: of the samples [s].
+        mask: (M, 16) samples that count.
+        rows: (M,) rows of the grid of the signals.
+        starts: name of a start -> deviations of the keys of its effect.
+        tangents: name of a tangent -> start and key.
+
+    """
+
+    channels = tuple(name for group in CHANNELS.values() for name in group)
+    highest = np.repeat([FASTEST[group] for group in CHANNELS], [6, 3, 3, 4])
+
+    def __init__(self, flight: Recording, robot: RobotParameters, body: BodyModel,
+                 keys: dict[str, Key], p: GapParameters):
+        self.flight, self.robot, self.keys, self.p, self._body = flight, robot, keys, p, body
+        self.name, self.period, self.modules = flight.name, THIN * p.grid, 0.0
+        self.starts: dict[str, dict[str, float]] = {}
+        self.tangents: dict[str, tuple[str, str]] = {}
+        self.signals = Signals(flight, robot, p)
+        self._length = round(p.servo_window / p.grid)
+        count = len(self.signals.t) - round(p.servo_warm_up / p.grid) - 1
+        self._starts = np.arange(0, count - self._length + 1, self._length) \
+            + round(p.servo_warm_up / p.grid)
+        self._kept: tuple = (None, None)        # delays of the last windows, and these
+        self._runs: dict[frozenset, np.ndarray] = {}    # deviations -> simulated servos
+        self.trusted = self._trusted()
+        first, count = self._starts[0], self._length * len(self._starts)
+        self.rows = first + THIN * np.arange(count // THIN)
+        self._readings = low_pass(p.smooth_imu, 1, p.grid)
+        self._fine = low_pass(WIDEST, 1, p.grid)
+        self._poses = low_pass(POSES, 1, p.grid)
+        self.mask = np.ones((len(self.rows), len(self.channels)), dtype=bool)
+        self.mask[:, :6] = self.trusted[self.rows, None]
+        far = self._poses.margin
+        inside = (self.rows >= far) & (self.rows < len(self.signals.t) - far)
+        self.mask[:, 6:12] = inside[:, None]
+        self.usable = len(blocks_of(self.mask, self.period)) > 0
+
+    def _trusted(self):
+        """(N,) whether a grid point is not at the rotor limit for its voltage, nor grounded."""
+        s, p = self.signals, self.p
+        bad = s.pose({})[0][:, 2] < p.contact_height
+        rows = sorted(self.robot.rotors.map, key=lambda row: row.voltage)
+        if rows:
+            volts = s.voltage * self.robot.battery.full_voltage
+            most = np.interp(volts, [row.voltage for row in rows],
+                             [row.thrust_max for row in rows])
+            commanded = self.flight.values[COMMAND][np.clip(np.searchsorted(
+                self.flight.times[COMMAND], s.t) - 1, 0, None), 4:].max(axis=1)
+            bad |= commanded > p.limit_margin * most
+        # Rotor lag: a limit also affects the following samples.
+        memory = round(5 * self.robot.rotors.time_constant / p.grid)
+        spread = np.convolve(bad, np.ones(memory))[:len(bad)] > 0
+        return ~spread
+
+    def _inputs(self, theta):
+        """Inputs of the body equations, name -> (M, width)."""
+        s = self.signals
+        thrust, thrust_rate = s.thrust(theta)
+        position, quaternion, velocity = s.pose(theta)
+        tilt, tilt_rate, tilt_acceleration, _ = s.joints(theta)
+        inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': s.imu(theta)[1],
+                  'tilt': tilt, 'tilt_rate': tilt_rate, 'tilt_acceleration': tilt_acceleration,
+                  # as the readings are smoothed that the forces are compared with
+                  'thrust': within(self._readings, thrust, 0),
+                  'thrust_rate': within(self._readings, thrust_rate, 0), 'position': position,
+                  'voltage': s.voltage, 'charge': s.charge,
+                  'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0))}
+        return {name: values[self.rows] for name, values in inputs.items()}
+
+    def residual(self, theta: dict[str, float], groups: str = 'BAWJ') -> dict[str, np.ndarray]:
+        """Group -> (M, channels) measured minus expected."""
+        result = {}
+        force, rate, turning = self.signals.imu(theta)
+        if 'B' in groups:
+            result['B'] = np.concatenate([force, turning], axis=1)[self.rows] \
+                - self._body(self._inputs(theta), theta)
+        if 'A' in groups or 'W' in groups:
+            position, quaternion, _ = self.signals.pose(theta)
+            rotation = matrices(quaternion)
+        if 'A' in groups:
+            world = np.einsum('nij,nj->ni', rotation, force)
+            world[:, 2] -= self.robot.gravity
+            result['A'] = (within(self._poses, world, 0)
+                           - within(self._poses, position, 2))[self.rows]
+        if 'W' in groups:
+            change = np.gradient(rotation, self.p.grid, axis=0)
+            skew = np.einsum('nji,njk->nik', rotation, change)
+            seen = np.stack([skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0],
+                             skew[:, 1, 0] - skew[:, 0, 1]], axis=1) / 2
+            result['W'] = within(self._poses, rate - seen, 0)[self.rows]
+        if 'J' in groups:
+            first, count = self._starts[0], self._length * len(self._starts)
+            run = self._runs.get(frozenset(theta.items()))
+            run = self._servos([theta], theta)[0] if run is None else run
+            result['J'] = self._of_joints(self.signals.joints(theta)[3][first:first + count]
+                                          - run.reshape(-1, 4))
+        return result
+
+    def _of_joints(self, series):
+        """Filtered and thinned series (N, 4) of the joints."""
+        return within(self._fine, series, 0)[::THIN]
+
+    def linear(self, theta: dict[str, float], names: list[str]) -> Linear:
+        """Residual and its slopes at deviations ``theta`` of keys, starts and tangents."""
+        theta, own = self._real(theta)
+        ends = {name: self._ends(name, theta, own) for name in names if name in self.starts}
+        # the servos of all at once; none of them changes a sensor
+        sets = list({frozenset(each.items()): each for each in (
+            theta, *(end for both in ends.values() for end in both))}.items())
+        runs = self._servos([each for _, each in sets], theta)
+        self._runs = dict(zip((key for key, _ in sets), runs, strict=True))
+        now = self.residual(theta)
+        residual = np.concatenate([now[group] for group in PLACE], axis=1)
+        slopes = np.zeros((*residual.shape, len(names)))
+        # name -> key and factor of its slope; a tangent counts where its start acts
+        factors = {name: (name, 1.0) for name in names
+                   if name not in self.starts and name not in self.tangents}
+        factors |= {name: (key, self.starts[start][key])
+                    for name, (start, key) in self.tangents.items()
+                    if start in own and name in names}
+        keys = list(dict.fromkeys(key for key, _ in factors.values()))
+        of_keys = self._slopes(theta, now, keys)
+        for k, name in enumerate(names):
+            if name in self.starts:
+                groups = ''.join({g for key in self.starts[name] for g in self.keys[key].groups})
+                behind, ahead = (now if end == theta else self.residual(end, groups)
+                                 for end in ends[name])
+                for group in groups:
+                    slopes[:, PLACE[group], k] = (ahead[group] - behind[group]) \
+                        / own.get(name, 1.0)
+            elif name in factors:
+                key, part = factors[name]
+                slopes[:, :, k] = part * of_keys[:, :, keys.index(key)]
+        self._runs = {}
+        return Linear(residual, slopes, residual)
+
+    def _slopes(self, theta, now, names):
+        """(M, 16, K) derivatives by keys at ``theta``, where the residual is ``now``."""
+        slopes = np.zeros((len(self.rows), len(self.channels), len(names)))
+        body = [k for k, name in enumerate(names) if self.keys[name].body]
+        if body:
+            slopes[:, PLACE['B'], body] = -self._body.derivatives(
+                self._inputs(theta), theta, tuple(names[k] for k in body))
+        for k, name in enumerate(names):
+            key = self.keys[name]
+            groups = '' if key.body else key.groups.replace('J', '')
+            if name in POSE_SHIFTS:
+                groups = groups.replace('A', '').replace('W', '')
+                slopes[:, 6:12, k] = POSE_SHIFTS[name] * self._of_pose_shift(theta)
+            if groups:
+                h, here = key.step, theta.get(name, 0.0)
+                ahead = self.residual({**theta, name: here + h}, groups)
+                both = key.parameter == BOTH_SIDES
+                behind = self.residual({**theta, name: here - h}, groups) if both else now
+                for group in groups:
+                    slopes[:, PLACE[group], k] = (ahead[group] - behind[group]) / (
+                        2 * h if both else h)
+        turning = [name for name in names if 'J' in self.keys[name].groups]
+        for name, slope in zip(turning, self._joint_slopes(theta, turning), strict=True):
+            slopes[:, PLACE['J'], names.index(name)] = slope
+        return slopes
+
+    def _of_pose_shift(self, theta):
+        """
+        Derivatives (M, 6) of accelerations and rates by a time shift of the poses.
+
+        They are those of the IMU. The derivative of the poses would explain their own noise,
+        shifted in time.
+        """
+        force, _, turning = self.signals.imu(theta)
+        jerk = np.einsum('nij,nj->ni', matrices(self.signals.pose(theta)[1]),
+                         np.gradient(force, self.p.grid, axis=0))
+        return -within(self._poses, np.concatenate([jerk, turning], axis=1), 0)[self.rows]
+
+    def _real(self, theta):
+        """Deviations of real keys, and factor of each start that acts."""
+        own = {name: value for name, value in theta.items() if name in self.starts and value}
+        theta = {name: value for name, value in theta.items()
+                 if name not in self.starts and name not in self.tangents and value}
+        return self._started(theta, own), own
+
+    def _started(self, theta, own):
+        return {**theta, **{key: theta.get(key, 0.0) + factor * part
+                            for name, factor in own.items()
+                            for key, part in self.starts[name].items()}}
+
+    def restart(self, theta: dict[str, float]) -> dict[str, float]:
+        """
+        Move the starts that act in ``theta`` to their fitted values.
+
+        All flights share the starts. Where a start acts, its factor becomes one, and its tangents
+        become zero.
+        """
+        new = {name: 1.0 for name in self.starts if theta.get(name)}
+        for tangent, (name, key) in self.tangents.items():
+            if name in new:
+                self.starts[name][key] *= max(theta[name] + theta.get(tangent, 0.0), LEAST)
+                new[tangent] = 0.0
+        return new
+
+    def _ends(self, name, theta, own):
+        """Deviations without the effect of a start, and with it as far as it acts, else whole."""
+        start = self.starts[name]
+        # of another start of the same effect, only one can act
+        without = {key: theta[key] - own[name] * part if name in own else 0.0
+                   for key, part in start.items()}
+        without = {key: value for key, value in (theta | without).items() if abs(value) > 1e-12}
+        return without, theta if name in own else self._started(without, {name: 1.0})
+
+    def settle(self, theta: dict[str, float]) -> None:
+        """
+        With noisy encoders, take the fast part of the tilts from the servo model at ``theta``.
+
+        Noise in the tilts would enter the residual and the slopes of the body equations. A fit
+        explains its second derivative by a larger mass of the tilting modules, for example.
+        """
+        s, theta = self.signals, self._real(theta)[0]
+        if s.reading_noise < self.p.guide_above:
+            return
+        run = self._servos([theta], theta)[0].reshape(-1, 4)
+        tilts = s.joints(theta)[0].copy()
+        tilts[self._starts[0]:self._starts[0] + len(run)] = run
+        s.use_model_tilts(tilts)
+        self._kept = None, None
+
+    @property
+    def motion(self) -> dict[str, np.ndarray]:
+        """Velocity (world), quaternion, position and tilts of the samples."""
+        return self._inputs({})
+
+    @property
+    def time(self) -> np.ndarray:
+        """(M,) times of the samples [s]."""
+        return self.signals.t[self.rows]
+
+    def _servos(self, sets, at):
+        """Simulated servos (P, W, M, 4) of each set, with initial states and loads at ``at``."""
+        windows, edges = self._windows(at)
+        delays = [self.signals.delays(theta)[0] for theta in sets]
+        of_delays = {delay: self._targets(edges, delay) for delay in set(delays)}
+        targets = [of_delays[delay] for delay in delays]
+        runs = simulate(self.robot, windows, np.array(targets), sets, self.modules)
+        return runs.transpose(0, 2, 1, 3)
+
+    def _targets(self, edges, delay):
+        """(K, W, 4) mean delayed commands [rad] between the steps ``edges`` (W, K + 1) [s]."""
+        means = self.signals.tilt_targets(edges.ravel(), delay)
+        # The mean from the end of a window to the next one is dropped.
+        means = np.concatenate([means, means[-1:]]).reshape(*edges.shape, 4)
+        return means[:, :-1].transpose(1, 0, 2)
+
+    def _joint_slopes(self, theta, names):
+        """
+        Derivatives (M, 4) of the joints' residual by each key.
+
+        The derivative by an encoder delay uses the rate of the simulated servo. The rate of the
+        encoder would explain its own noise, shifted in time.
+        """
+        # Servos are independent, so one run with all gains changed gives the slope of each.
+        sources = [f'joint_bandwidth.{self.keys[name].parameter}'
+                   if self.keys[name].effect == 'servo' else name for name in names]
+        moved = list(dict.fromkeys(sources))
+        sizes = [self.keys[name].step for name in moved]
+        # Central differences: gains, loads and inertia scaled by one factor leave the motion
+        # unchanged, and with one-sided differences their slopes would not add up to zero.
+        sets = [theta, *({**theta, name: theta.get(name, 0.0) + side * h}
+                         for side in (1, -1) for name, h in zip(moved, sizes, strict=True))]
+        runs = self._servos(sets, theta)
+        rate, slopes = np.gradient(runs[0], self.p.grid, axis=1), {}
+        ahead, behind = runs[1:].reshape(2, len(moved), *runs[0].shape)
+        for name, change in zip(moved, ahead - behind, strict=True):
+            slope = rate * SHIFTS.get(name, 0.0) - change / (2 * self.keys[name].step)
+            slopes[name] = self._of_joints(slope.reshape(-1, 4))
+        return [slopes[source] * (np.arange(4) == self.keys[name].index)
+                if source != name else slopes[name]
+                for name, source in zip(names, sources, strict=True)]
+
+    def _windows(self, theta):
+        """Windows of the servos and the edges of their steps; the last ones are kept."""
+        timing = {name: theta.get(name, 0.0) for name in SHIFTS}
+        if self._kept[0] != timing:
+            self._kept = timing, self._make_windows(timing)
+        return self._kept[1]
+
+    def _make_windows(self, theta):
+        p, s = self.p, self.signals
+        skip, count = round(p.servo_warm_up / p.servo_step), round(p.servo_window / p.servo_step)
+        begins = s.t[self._starts] - skip * p.servo_step
+        edges = begins[:, None] + p.servo_step * np.arange(skip + count + 1)
+        tilt, rate, _, _ = s.joints(theta)
+        at = self._starts - round(p.servo_warm_up / p.grid)
+        middle = edges[:, :-1] + p.servo_step / 2
+        index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
+        loads = (s.thrust({})[0], module_load(s, theta), *undescribed_load(s, theta))
+        force, load, *more = (series[index].transpose(1, 0, 2) for series in loads)
+        return Windows(tilt[at], rate[at], force, load, p.servo_step, skip,
+                       round(p.grid / p.servo_step), tuple(more)), edges
+
+
+def starts_of(key, models):
+    """Starts of an effect without a slope; of a limit, where it begins to act in these flights."""
+    treatment = TREATMENTS[key.effect]
+    if treatment.limit is None:
+        return treatment.starts
+    what, below = treatment.limit
+    most = max(float({
+        'tilt_rate': lambda m: np.abs(m.signals.joints({})[1]).max(),
+        'torque': lambda m: np.quantile(np.abs(_torques(m)), 0.999),
+        'thrust': lambda m: np.quantile(m.flight.values[COMMAND][:, 4:], 0.999)}[what](m))
+        for m in models)
+    return tuple((float(np.log(part * most / key.base)),) for part, in treatment.starts
+                 if part * most < below * key.base)
+
+
+def _torques(model):
+    """
+    Torques [N m] that the simulated servo loops request, without limits and encoder noise.
+
+    They include damping, which takes most of the stiffness term while a servo turns.
+    """
+    s, joint = model.signals, model.robot.joints
+    run = model._servos([{}], {})[0]
+    rate = np.gradient(run, model.p.grid, axis=1)
+    times = s.t[model._starts][:, None] + model.p.grid * np.arange(run.shape[1])
+    edges = np.append(times.ravel(), times[-1, -1] + model.p.grid)
+    target = s.tilt_targets(edges, s.delays({})[0]).reshape(run.shape)
+    return Servo.of(joint, effort_limit=None).motor(NUMPY, target - run, rate)

@@ -1,0 +1,257 @@
+"""Verdict about flights of bags and of tables: channels, priors, entries, and the engine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.identify.flights.bag_flight import BagFlight, starts_of
+from beetle_omni_ros.identify.flights.balance import Balance, SLOW
+from beetle_omni_ros.identify.flights.body import BodyModel, swing_of, tilting_modules
+from beetle_omni_ros.identify.flights.engine import Engine
+from beetle_omni_ros.identify.flights.keys import (
+    all_keys,
+    entries_of,
+    Entry,
+    extra_keys,
+    keys_of,
+    LIMITS,
+    Prior,
+    prior_of,
+    THRUST_BUS,
+    TILT_BUS,
+    tolerances,
+    VARYING,
+)
+from beetle_omni_ros.identify.flights.quality import explained
+from beetle_omni_ros.identify.flights.results import ALPHA, concluded, result_of
+from beetle_omni_ros.identify.flights.signals import IMU_LAG
+from beetle_omni_ros.identify.flights.table_flight import COMPARED, GROUPS, TableFlight
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
+from beetle_omni_ros.identify.recording.bag import Recording
+from beetle_omni_ros.identify.recording.parameters import GapParameters
+from beetle_omni_ros.identify.recording.table import Format, read_flight
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
+
+LATE = 0.012, 0.024          # [s] latencies at which the tilting modules are decided, too
+BAG_GROUPS = {group: {'used': True, 'channels': [c for c in BagFlight.channels
+                                                 if c.startswith(group)]}
+              for group in ('force', 'torque', 'acceleration', 'rate', 'joint')}
+# Entries of each group of channels. Those of the torques also need the forces.
+FORCES = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_drag',
+          'axial_inflow', 'translational_lift', 'wind', 'voltage_sag', 'rotor_lag',
+          'rotor_dead_time', 'command_latency', 'imu_accelerometer_bias', 'imu_misalignment')
+TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coefficient',
+           'rotor_hub_moment', 'propeller_gyroscopic_torque', 'rotor_acceleration_torque')
+EXPLAINED = 0.5         # share of the angular acceleration: below, errors exceed what is explained
+FEEDBACK = ('the commands explain less than half of the angular acceleration: a controller that '
+            'feeds back what the model lacks would be taken for the robot')
+WEIGHED = 'mass', 'inertia'
+LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
+# Entries of the comparison of IMU and MoCap.
+SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
+
+
+def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: RobotParameters,
+           p: GapParameters, alpha: float = ALPHA) -> dict:
+    """Results of checked flights of bags; ``judging`` is held out."""
+    keys = {**all_keys(robot), **extra_keys()}
+    body = BodyModel(robot, keys, tilting_modules(robot))
+    every = [BagFlight(flight, robot, body, keys, p) for flight in [*flights, *judging]]
+    models, others = every[:len(flights)], every[len(flights):]
+    if robot.multibody is not None:
+        _choose_modules(models, every)
+    starts = _starts(keys, models)
+    tangents = {f'{name}~{key}': (name, key) for name, start in starts.items() for key in start}
+    for model in every:
+        model.starts, model.tangents = starts, tangents
+    coarse = float(np.median([m.signals.position_noise for m in models])) > p.coarse_noise
+    late, kept = _delays(robot, p, coarse)
+    tolerance = tolerances(p) | late
+    priors, entries, bounds, far = _priors(robot, {
+        n: key for n, key in keys.items() if key.effect in CATALOGUE and not key.form
+        and key.effect not in LIMITS}, tolerance)
+    priors |= {n: Prior(tolerance[n], key.typical, 0.0) for n, key in extra_keys().items()
+                if n != 'modules.share' or robot.multibody is not None}
+    for start, own in starts.items():
+        name, moved = start.partition('@')[0], [f'{start}~{key}' for key in own]
+        priors[start] = Prior(0.03, 1.0, 0.0)
+        priors |= {tangent: Prior(0.001, 0.3, 0.0) for tangent in moved}
+        entries.append(Entry(name, (start, *moved), None, TREATMENTS[name].channels == 'B'))
+    bounds |= dict.fromkeys(starts, (0.0, np.inf)) | kept
+    varying = {n: VARYING[n.partition('[')[0]] for n in priors if n.partition('[')[0] in VARYING}
+    if len(models) > 1:
+        priors |= {n: replace(priors[n], flight=0.0) for n in varying}
+    engine = Engine(models, priors, entries, bounds, far, alpha, varying=varying,
+                    kept=frozenset(kept), clock=IMU_LAG, curved=frozenset({*starts, *tangents}))
+    solution = engine.run()
+    for model in others:
+        model.settle(dict(zip(engine.names[:engine.real], solution.theta, strict=False)))
+    return concluded(engine, solution, keys, others or models, BAG_GROUPS, starts=starts,
+                     held_out=bool(judging))
+
+
+def _priors(robot, keys, tolerance, stamps=0.0, weighed=WEIGHED):
+    """
+    Spreads, entries, bounds of keys of the catalogue, and those that may be far from the file.
+
+    A mass is weighed and sensors have data sheets; maps of thrust differ by half.
+    """
+    priors = {n: prior_of(robot, key, tolerance.get(n, 0.0), stamps) for n, key in keys.items()}
+    bounds = {n: (0.0, np.inf) for n, key in keys.items() if key.ends_at_none}
+    far = frozenset(n for n, key in keys.items() if key.effect not in weighed
+                    and CATALOGUE[key.effect].layer not in ('sensor', 'timing'))
+    return priors, entries_of(keys), bounds, far
+
+
+def _choose_modules(models, every):
+    """Use the file's tilting modules if the servos agree better with them, at any latency."""
+    costs = []
+    for share in (0.0, 1.0):
+        for model in models:
+            model.modules = share
+            model.settle({})
+        costs.append(min(sum(float(np.log(r.var(axis=0)).sum()) for model in models
+                             for r in model.residual(late, 'BJ').values())
+                         for late in ({}, *({'command_latency.delay': d} for d in LATE))))
+    for model in every:
+        model.modules = float(np.argmin(costs))
+
+
+def _starts(keys, models):
+    """Name of a start -> deviations of the keys of its effect."""
+    result = {}
+    for name in LIMITS:
+        own = [key for key in keys.values() if key.effect == name and not key.form]
+        for k, start in enumerate(starts_of(own[0], models)):
+            result[f'{name}@{k}'] = dict(zip([key.name for key in own], start, strict=True))
+    return result
+
+
+def _delays(robot, p, coarse):
+    """
+    Prior deviations of delays and of the apparent inertia of servos, and their limits.
+
+    Beyond a limit, a deviation is a finding. ``coarse`` sensors are also late.
+    """
+    bus, imu = (-p.command_delay, p.bus_late), p.coarse_imu if coarse else p.imu_averaging
+    swing = swing_of(robot)
+    deviations = {TILT_BUS: p.bus_near, THRUST_BUS: p.bus_near, IMU_LAG: imu,
+                  'swing.ratio': p.tolerance_swing + swing}
+    limits = {TILT_BUS: bus, THRUST_BUS: bus, IMU_LAG: (0.0, imu),
+              'swing.ratio': (-p.tolerance_swing, swing + p.tolerance_swing)}
+    if coarse:
+        deviations['joint_feedback_delay.delay'] = p.coarse_encoders
+        limits['joint_feedback_delay.delay'] = 0.0, p.coarse_encoders
+    return deviations, limits
+
+
+def _engine(flights, robot, p, declared, alpha, progress):
+    """Engine of flights of tables with the entries that channels and signals can show."""
+    channels, signals, names = flights[0].channels, set(declared.signals), set(FORCES)
+    if any(name.startswith('torque') for name in channels):
+        names |= set(TORQUES)
+    if any(name.startswith(COMPARED) for name in channels):
+        names |= set(SENSORS)
+    if 'position' not in signals:
+        names -= {'ground_effect'}
+    if not {'position', 'velocity'} & signals:
+        names -= {'rotor_drag', 'body_drag', 'axial_inflow', 'translational_lift',
+                  'rotor_hub_moment'}
+    if 'voltage' not in signals:
+        names -= {'voltage_sag'}
+    if 'force_x' not in channels:
+        names -= {'imu_misalignment', 'wind', 'rotor_drag', 'body_drag'}
+    keys = keys_of(robot, names)
+    # Air is still in a hall.
+    priors, entries, bounds, far = _priors(robot, keys, tolerances(p), declared.clock_deviation,
+                                            (*WEIGHED, 'wind'))
+    if 'specific_force' not in signals:     # the lag is that of an estimator
+        priors |= {name: replace(priors[name], narrow=priors[name].typical)
+                    for name, key in keys.items() if key.effect in LAGS}
+        entries = [entry for entry in entries if entry.name not in LAGS]
+    return Engine(flights, priors, entries, bounds, far, alpha, progress), keys
+
+
+def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
+                ) -> list[TableFlight]:
+    """
+    Read flights.
+
+    Raises:
+        LogError, ParameterError: unusable file or format.
+
+    """
+    if not {'duty', 'thrust'} & set(declared.signals):
+        raise ParameterError(f"--format {declared.name}: expected the key 'duty' or 'thrust'")
+    keys = keys_of(robot, {*FORCES, *TORQUES, *SENSORS})
+    body = BodyModel(robot, {**all_keys(robot), **extra_keys()}, (0.0, 0.0))
+    return [TableFlight(read_flight(path, declared), robot, body, keys) for path in paths]
+
+
+def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight],
+                  robot: RobotParameters, p: GapParameters, declared: Format,
+                  alpha: float = ALPHA, progress: Callable[[str], None] = lambda text: None
+                  ) -> dict:
+    """
+    Results of flights of one format; ``judging`` is held out.
+
+    Raises:
+        ParameterError: a flight has other channels than the first one.
+
+    """
+    usable = [flight for flight in flights if flight.usable]
+    if all(flight.apart for flight in usable):
+        for flight in [*flights, *judging]:
+            flight.without(COMPARED, flight.apart)
+    groups = _groups(flights[0] if not usable else usable[0], declared)
+    if not usable:
+        return result_of('bad_data', groups, 'No flight can be used: '
+                         f'{flights[0].name} has no block of commands and measurements in the air')
+    for flight in [*usable, *judging]:
+        if flight.usable and flight.channels != usable[0].channels:
+            raise ParameterError(f'{flight.name}: its channels are '
+                                 f"{', '.join(flight.channels)}, expected those of "
+                                 f"{usable[0].name}: {', '.join(usable[0].channels)}")
+    findings = [f'{flight.name}: not used, no block of commands and measurements in the air'
+                for flight in [*flights, *judging] if not flight.usable] + [
+        f'{flight.name}: {flight.apart}, so they are not compared'
+        for flight in [*flights, *judging] if flight.apart]
+    engine, keys = _engine(usable, robot, p, declared, alpha, progress)
+    solution = engine.run()
+    if groups['torque']['used'] and explained(engine, solution, 'torque') < EXPLAINED:
+        for flight in [*usable, *judging]:
+            flight.without(('torque',), FEEDBACK)
+        groups = _groups(usable[0], declared)
+        engine, keys = _engine(usable, robot, p, declared, alpha, progress)
+        solution = engine.run()
+    progress('judging')
+    judges = [flight for flight in judging if flight.usable] or usable
+    slow = [part for f in usable if (part := f.balance(list(keys_of(robot, SLOW))))]
+    if slow:
+        groups['torque'] = {'used': True, 'channels': ['torque_x', 'torque_y'],
+                            'reason': 'no gyroscope: means of 2 s, by the attitude'}
+    return concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
+                     findings=findings, slow=Balance(slow, robot) if slow else None,
+                     measured='specific_force' in declared.signals)
+
+
+def _groups(flight, declared):
+    """Each group of channels: whether it is used, and why not."""
+    groups = {}
+    for group in GROUPS:
+        own = {c: why for c, why in flight.reasons.items() if c.startswith(group)}
+        used = [c for c, why in own.items() if not why]
+        unused = sorted({why for why in own.values() if why})
+        groups[group] = {'used': bool(used), 'channels': used,
+                         **({'reason': '; '.join(unused)} if unused else {})}
+    signals = declared.signals
+    groups['joint'] = {'used': False, 'channels': [],
+                       'reason': 'not compared for tables' if 'tilt' in signals
+                       else 'the rotors do not tilt'}
+    return groups
