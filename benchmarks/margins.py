@@ -38,7 +38,7 @@ from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.campaign import workers
 from beetle_omni_ros.flight.evaluate import fly
 from beetle_omni_ros.model import dynamics as model
-from beetle_omni_ros.model.catalogue import validated
+from beetle_omni_ros.model.effects import validated
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 
