@@ -60,6 +60,8 @@ FILES = {
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
     'train_any.yaml': ('train.parameters:TrainParameters',
                        'The training for robots that differ.'),
+    'train_late.yaml': ('train.parameters:TrainParameters',
+                        'What a training for robots with late commands and joints changes.'),
     'train_published.yaml': ('train.parameters:TrainParameters',
                              'The training with the settings of the publication.'),
     'gap.yaml': ('identify.recording.parameters:GapParameters', 'The gap finder.')}

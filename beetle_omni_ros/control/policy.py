@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from beetle_omni_ros.model.rotations import entries
 from beetle_omni_ros.model.schema import parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
+LONGEST_STEP = 0.1      # [s] between two states; after a longer gap the history is empty
 LATEST = 10             # steps within which a command is reported as the executed command
 COMMAND_DELAY = 0.01    # [s] from the state stamp to the actuators, for the disturbance estimate
 # An action beyond is a fault: it is sent to the supervisor unchanged; smaller ones are clipped to
@@ -65,9 +67,11 @@ class PolicyController:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the last commands, the estimate and all counts."""
+        """Reset the last commands, the history, the estimate and all counts."""
         self._steps = self._faults = self._cut = 0
         self._guidance.reset()
+        self.network.reset()
+        self._stamp = -inf
         self._latest: deque[list[float]] = deque(maxlen=LATEST)
         if self._estimator:
             self._estimator.reset()
@@ -75,6 +79,9 @@ class PolicyController:
     def step(self, state: State, target: Target) -> Command:
         """One command for one state."""
         self._steps += 1
+        if state.stamp - self._stamp > LONGEST_STEP:
+            self.network.reset()
+        self._stamp = state.stamp
         command = state.command
         executed = command and command.tilt.tolist() + command.thrust.tolist()
         if isinstance(target, PoseTarget):      # in charge: the executed command is a latest one

@@ -56,6 +56,13 @@ def test_other_metadata_are_refused_with_the_entry_and_both_values(metadata, nam
     assert '\n' not in text and all(part in text for part in named), text
 
 
+@pytest.mark.parametrize('size', [7, 20])
+def test_a_history_without_whole_rows_is_refused(tmp_path, size):
+    path = write(tmp_path / 'p.onnx', history=size)
+    with pytest.raises(ParameterError, match=r'expected .*history'):
+        PolicyNetwork(path, ROBOT)
+
+
 @pytest.mark.parametrize('flown, named', [
     (replace(ROBOT, mass=3.2, joints=replace(ROBOT.joints, kp=0.2)),
      ['mass 3.0386 in training, 3.2 here', 'joints.kp 0.3449 in training, 0.2 here']),
