@@ -1,9 +1,7 @@
 """
 Margins of the controllers: how much of each defect they tolerate in flight, and linear margins.
 
-    python benchmarks/margins.py [--controllers nmpc,rl,rl_any] [--plants robot,measured]
-                                 [--task random10] [--seed 5] [--policy FILE] [--jobs -1]
-                                 [--json FILE]
+    python benchmarks/margins.py --controllers nmpc,rl,rl_any --plants robot,measured
 
 One quantity at a time is added to the plant; estimator and controller have the shipped robot file.
 A flight tolerates it if every pose is reached, the mean U is at most 2 deg and the tilt commands
@@ -11,8 +9,8 @@ change by at most 0.02 rad (RMS) within 10 ms at the target. Bisection gives the
 and the smallest other value. It assumes that every larger value is not tolerated either.
 
 The linear margins are those of level hover, from the Jacobians of controller and robot, without
-the supervisor, the estimator of the state and noise; with `--plants ''` there are no flights.
-`--policy` flies with the controller `rl`. All flights take half an hour of 16 cores.
+the supervisor, the estimator of the state and noise; `--plants ''` flies none. `--policy` is that
+of `rl`. All flights take half an hour of 16 cores.
 """
 
 from __future__ import annotations
