@@ -43,6 +43,8 @@ FILES = {
     'rl_bare.yaml': ('control.policy:PolicyParameters', 'The policy without guidance.'),
     'rl_any.yaml': ('control.policy:PolicyParameters',
                        'The policy with the estimated disturbance as input.'),
+    'rl_late.yaml': ('control.policy:PolicyParameters',
+                     'The policy that observes its last steps.'),
     'rl_published.yaml': ('control.policy:PolicyParameters',
                           'The policy of train_published.yaml.'),
     'hover.yaml': ('control.hover:HoverParameters', 'The hover controller.'),

@@ -150,6 +150,11 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
         controller=_POLICY, parameters_file='params/rl_any.yaml',
         policy_file='policies/rl_any.onnx'),
     ControllerEntry(
+        name='rl_late', label='RL, late commands',
+        description='observes its last steps, trained with late commands',
+        controller=_POLICY, parameters_file='params/rl_late.yaml',
+        policy_file='policies/rl_late.onnx'),
+    ControllerEntry(
         name='rl_published', label='RL, published training',
         description='params/train_published.yaml, without guidance', controller=_POLICY,
         parameters_file='params/rl_published.yaml', policy_file='policies/rl_published.onnx',

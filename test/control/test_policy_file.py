@@ -99,7 +99,7 @@ def test_the_hash_of_values_in_any_order_with_further_ones_is_that_of_the_robot(
     assert robot_hash(turned) == robot_hash(trained_for(ROBOT)) == robot_hash(ROBOT)
 
 
-@pytest.mark.parametrize('name', ['rl', 'rl_any', 'rl_published'])
+@pytest.mark.parametrize('name', ['rl', 'rl_any', 'rl_late', 'rl_published'])
 def test_a_shipped_policy_of_a_version_that_covered_every_value_is_valid(name):
     network = PolicyNetwork(f'policies/{name}.onnx', ROBOT)
     assert network.contract.robot_hash == robot_hash(ROBOT)
