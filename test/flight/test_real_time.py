@@ -30,7 +30,7 @@ def test_a_flight_through_drivers_and_emulated_devices_holds_its_target():
         truth = loop.simulator.truth
         # a stall of the computer leads to the fallback, which is the same controller
         assert loop.supervisor.state in ('flying', 'fallback')
-        assert loop.supervisor.bridges == {'joint': 'ready', 'rotor': 'ready'}
+        assert loop.supervisor.inputs.bridges == {'joint': 'ready', 'rotor': 'ready'}
     assert np.linalg.norm(truth.position - [0, 0, 1.0]) < 0.1
     log = recorder.log()
     # Angles in counts of the encoder: they passed the registers of the servos.
