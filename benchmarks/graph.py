@@ -67,7 +67,7 @@ def measure(folder: Path, actuators: str, seconds: float) -> dict:
         sys.exit(f'flight with {actuators} failed (status {status})')
     log = read_bag(bag)
     t, *used = np.array(samples).T
-    begin, end = log.targets[0].stamp, log.state_t[log.states.index('landing')]
+    begin, end = log.targets[0].stamp, log.state_t[[s.state for s in log.states].index('landing')]
     found = {key: 100 * (np.interp(end, t, cpu) - np.interp(begin, t, cpu)) / (end - begin)
              for key, cpu in zip(('cpu_percent', 'bridges_cpu_percent'), used, strict=True)}
     newest = {status.name: status.values for status in log.diagnostics}
