@@ -31,7 +31,8 @@ LIBRARIES = ('casadi', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
 SOURCE = Path(__file__).resolve().parents[1]
 # Folders whose code decides the numbers of a flight and its metrics.
 FLOWN = ('bags', 'control', 'estimation', 'flight', 'model', 'sim', 'supervisor')
-PAGES = ('comparison_page', 'faults', 'summary')     # and code that decides none
+# Code in them that decides none.
+PAGES = {SOURCE / 'flight' / name for name in ('comparison_page.py', 'faults.py', 'summary.py')}
 LENGTH = 16  # hexadecimal digits kept of a digest
 LOST_WORKER = 'TerminatedWorkerError', 'BrokenProcessPool'
 
@@ -56,7 +57,7 @@ def file_digest(path: str | Path) -> str:
 def code_fingerprint(file: str) -> str:
     """Digest of libraries, parameters, the folders FLOWN without pages, and a flying ``file``."""
     files = [path for folder in FLOWN for path in (SOURCE / folder).rglob('*')
-             if path.suffix in ('.py', '.c', '.h') and path.stem not in PAGES]
+             if path.suffix in ('.py', '.c', '.h') and path not in PAGES]
     files += [Path(file), *share_path('params').glob('*.yaml')]
     return digest(platform.machine(), *map(str, versions().values()), *(
         part for path in sorted(files, key=lambda path: (path.parent.name, path.name))

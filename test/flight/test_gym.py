@@ -29,7 +29,11 @@ def env():
 
 @pytest.mark.filterwarnings('ignore::UserWarning')      # recommendations
 def test_it_keeps_the_rules_of_gymnasium(env):
-    check_env(env, skip_render_check=True, skip_close_check=True)
+    check_env(env, skip_render_check=True, skip_close_check=True)      # raises
+    observation, info = env.reset(seed=1)
+    assert observation in env.observation_space and observation.shape == (33,)
+    assert env.action_space.shape == (8,) and set(info) == {'position_error_m',
+                                                            'attitude_error_rad'}
 
 
 def test_the_shipped_policy_reaches_a_pose_and_repeats_by_the_seed(env):

@@ -2,6 +2,7 @@
 
 import io
 import json
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -87,3 +88,14 @@ def test_a_failed_flight_is_a_result_with_its_reason_and_not_stored(poses, tmp_p
     assert flown['failure'] is None and flown['metrics']['poses']
     assert 'ZeroDivisionError: no way out' in (tmp_path / 'out' / 'comparison.html').read_text()
     assert len(list((tmp_path / 'out' / '.flights').glob('*.npz'))) == 1
+
+
+@pytest.mark.parametrize(('file', 'decides'), [
+    ('sim/faults.py', True), ('flight/loop.py', True), ('bags/metrics.py', True),
+    ('flight/faults.py', False), ('flight/comparison_page.py', False)])
+def test_the_key_of_a_flight_covers_the_code_that_decides_it(file, decides, monkeypatch):
+    key, read = campaign.code_fingerprint.__wrapped__, Path.read_bytes
+    before = key(__file__)
+    monkeypatch.setattr(Path, 'read_bytes', lambda path: read(path) + b'#' * (
+        path == campaign.SOURCE / file))
+    assert (key(__file__) != before) is decides
