@@ -28,7 +28,6 @@ from beetle_omni_ros.options import (
     NamespaceOption,
     NmpcOption,
     one_of,
-    OtherRobotOption,
     OutputOption,
     PageOption,
     PlantOption,
@@ -64,7 +63,6 @@ def fly(controller: ControllerOption = DEFAULT,
         plant: PlantOption = None,
         nmpc: NmpcOption = None,
         policy: PolicyOption = None,
-        allow_other_robot: OtherRobotOption = False,
         standby: Annotated[bool, Option('--standby/--alone', help=(
             'Run the other controllers on standby, to be selected in flight, or only the active '
             'controller.'))] = True,
@@ -98,7 +96,6 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
              plant: PlantOption = None,
              nmpc: NmpcOption = None,
              policy: PolicyOption = None,
-             allow_other_robot: OtherRobotOption = False,
              without: Annotated[str, Option(metavar='LAYER,...', help=(
                  'Layers of the guidance that are off: unwinding, routing, trimming, or '
                  'all.'))] = '',
@@ -122,8 +119,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
                            for name in controllers):
         raise ParameterError(f'--without {without}: no controller with guidance among '
                              f"{', '.join(controllers)}")
-    options = {name: ControllerOptions(allow_other_robot=allow_other_robot, without=without)
-               for name in controllers}
+    options = {name: ControllerOptions(without=without) for name in controllers}
     for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
         name = OWNER[option]
         if file and name not in controllers:
