@@ -12,6 +12,7 @@ from typer import Argument, echo, Option
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, OWNER
 from beetle_omni_ros.identify_commands import identify
+from beetle_omni_ros.improve import improve
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.options import (
     Commands,
@@ -285,6 +286,9 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
     from beetle_omni_ros.identify.flights.command import run_gap
     return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
                    tolerances=tolerances, form=form, alpha=alpha)
+
+
+app.command()(improve)
 
 
 @app.command()
