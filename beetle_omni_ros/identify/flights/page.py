@@ -11,7 +11,21 @@ import numpy as np
 from beetle_omni_ros.identify.recording.bag import Recording
 from beetle_omni_ros.identify.recording.topics import begin_of
 from beetle_omni_ros.model.effects import CATALOGUE
-from beetle_omni_ros.show.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
+from beetle_omni_ros.show.figures import (
+    AFTER,
+    AMBER,
+    BEFORE,
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    legend,
+    panels,
+    PARTS,
+    RED,
+    STYLE,
+    svg,
+)
 from beetle_omni_ros.show.page import ABSENT, Grid, html, page, section, verdict_head
 
 WORDS = {'no_gap': 'no gap', 'named': 'named', 'named_set': 'one of a set',
@@ -22,9 +36,8 @@ LOPSIDED = 0.2          # asymmetry of an interval from which a sentence states 
 SPELLED = {'imu': 'IMU', 'mocap': 'MoCap'}
 SHOWN = 6               # channels and candidates in the terminal
 LEAST_CHANCE = 1e-6     # below, a probability is not stated as a number
-BEFORE, AFTER = COLOURS[1], COLOURS[0]
-VERDICT_COLOURS = {'no_gap': '#2b7a3d', 'named': '#1f5fa8', 'named_set': '#1f5fa8',
-                   'unknown': '#b06a00', 'not_decidable': '#b06a00', 'bad_data': '#b3261e'}
+VERDICT_COLOURS = {'no_gap': GREEN, 'named': BLUE, 'named_set': BLUE, 'unknown': AMBER,
+                   'not_decidable': AMBER, 'bad_data': RED}
 # Topic -> label of an axis -> names of its readings.
 LABELS = {
     'imu/data_raw': {'force [m/s^2]': 'xyz', 'rate [rad/s]': 'xyz'},
@@ -349,7 +362,7 @@ def _damage(recording, damage):
     first = 0
     for axis, (label_of, names) in zip(axes[:, 0], LABELS[topic].items(), strict=True):
         for k, name in enumerate(names):
-            axis.plot(t, values[:, first + k], lw=0.8, color=COLOURS[k], label=name)
+            axis.plot(t, values[:, first + k], lw=0.8, color=PARTS[k], label=name)
         first += len(names)
         axis.set_ylabel(label_of)
         axis.legend(loc='upper right', ncols=4)
