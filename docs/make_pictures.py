@@ -3,8 +3,8 @@ Fly and draw the pictures of the pages: ``python docs/make_pictures.py [NAME...]
 
 Without a name all are drawn that are stale: their function, the table of colours or a file that
 they read has changed. ``docs/pictures/inputs.json`` has the digests, and test/docs compares them.
-``hardware_flight`` needs ROS, films need an off-screen OpenGL. `make compare` draws those of
-the comparison, and how-to/view.md has a picture of a browser.
+``hardware_flight`` needs ROS, films need an off-screen OpenGL. Those of OTHERS have another
+command, which is printed if they are stale; a name then records that it has been run.
 """
 
 from __future__ import annotations
@@ -12,11 +12,14 @@ from __future__ import annotations
 from collections.abc import Callable
 import inspect
 import json
+import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 import tempfile
 
+import drawings
 import film
 import matplotlib
 from matplotlib.figure import Figure
@@ -24,11 +27,12 @@ import numpy as np
 
 import beetle_omni_ros as bo
 from beetle_omni_ros.bags.log import motion
+from beetle_omni_ros.flight import comparison_page
 from beetle_omni_ros.flight.campaign import digest
 from beetle_omni_ros.identify.flights.page import picture_of
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.show import figures
+from beetle_omni_ros.show import figures, scene
 from beetle_omni_ros.show.figures import AFTER, BEFORE, colours_of, FAINT, INK, PARTS, STYLE
 
 DOCS = Path(__file__).resolve().parent
@@ -126,7 +130,8 @@ def own_robot():
         (folder / 'heavy.yaml').write_text(blocks_of('own_robot', 'yaml')[0])
         for command in blocks_of('own_robot', 'sh')[:2]:
             subprocess.run(['bash', '-ec', command], cwd=folder, check=True,
-                           stdout=subprocess.DEVNULL)
+                           stdout=subprocess.DEVNULL, env={**os.environ, 'PATH': os.pathsep.join(
+                               [str(Path(sys.executable).parent), os.environ['PATH']])})
         return drawn_errors({name: bo.read_run(folder / name)
                              for name in ('known', 'wrong', 'slow')}, 'Two poses', 2 * POSE)
 
@@ -216,52 +221,82 @@ PICTURES: dict[str, tuple[Callable, tuple[str, ...]]] = {
         (own_robot, ('docs/tutorials/own_robot.md',)), (own_gap, ()),
         (real_gap, ('params/crazyflie.yaml', 'test/data/nanobench/*.csv.gz')),
         (hardware_flight, ()))},
-    'pictures/flight.gif': (flight, SHIPPED), 'pictures/gap.gif': (gap, SHIPPED)}
+    'pictures/flight.gif': (flight, SHIPPED), 'pictures/gap.gif': (gap, SHIPPED),
+    **{f'pictures/{made.__name__}.svg': (made, read) for made, read in (
+        (drawings.architecture, ('beetle_omni_ros/ros/graph.py',)),
+        (drawings.real_flights, ('params/crazyflie.yaml', 'test/data/nanobench/*.csv.gz')),
+        (drawings.frames, ('params/robot.yaml',)), (drawings.wiring, ()))}}
+# Pattern below docs/ -> the command that draws other pictures, and the functions that do it.
+OTHERS: dict[str, tuple[str, tuple[Callable, ...]]] = {
+    'comparison/*_convergence_*.png': ('make compare', (
+        comparison_page.convergence, figures.legend)),
+    'comparison/*_errors_*.png': ('make compare', (comparison_page.in_time, figures.legend)),
+    'pictures/view.png': ('beetle_omni view RUN RUN, photographed in a browser', (scene.Room,))}
 
 
 def sources(function: Callable) -> str:
-    """Text of a function and of the functions of this file that it calls."""
-    names, texts = [function.__name__], []
+    """Text of a class, or of a function and the functions of its file that it calls."""
+    if inspect.isclass(function):
+        return inspect.getsource(function)
+    names, texts, known = [function.__name__], [], function.__globals__
     for name in names:
-        found = globals()[name]
-        texts.append(inspect.getsource(found))
-        names += [other for other in found.__code__.co_names if other not in names
-                  and inspect.isfunction(globals().get(other))
-                  and globals()[other].__module__ == __name__]
+        texts.append(inspect.getsource(known[name]))
+        names += [other for other in known[name].__code__.co_names if other not in names
+                  and inspect.isfunction(known.get(other))
+                  and known[other].__module__ == function.__module__]
     return ''.join(texts)
 
 
 def inputs(name: str) -> str:
-    """Digest of everything that decides a picture, except for the package itself."""
-    function, read = PICTURES[name]
-    modules = [film] if 'film.' in sources(function) else []
+    """Digest of everything that decides a picture, except for most of the package itself."""
+    function, read = PICTURES.get(name, (None, ()))
+    drawn_by = (function,) if function else next(
+        drawn_by for pattern, (_, drawn_by) in OTHERS.items() if Path(name).match(pattern))
+    text = ''.join(map(sources, drawn_by))
     colours = figures.LINES, PARTS, BEFORE, AFTER, INK, FAINT, STYLE
-    return digest(sources(function), repr(colours),
-                  *map(inspect.getsource, modules),
-                  *(path.read_bytes() for pattern in read for path in sorted(ROOT.glob(pattern))))
+    return digest(text, repr(colours), *([inspect.getsource(film)] if 'film.' in text else []),
+                  *(b''.join(re.findall(b'```.*?```', path.read_bytes(), re.S))
+                    if path.suffix == '.md' else path.read_bytes()     # the code of a page
+                    for pattern in read for path in sorted(ROOT.glob(pattern))))
 
 
-def stale() -> list[str]:
-    """Pictures whose recorded digest is not that of their inputs."""
-    recorded = json.loads(INPUTS.read_text()) if INPUTS.is_file() else {}
-    return [name for name in PICTURES if recorded.get(name) != inputs(name)]
+def commands() -> dict[str, str]:
+    """Every picture that has an entry -> the command that draws it."""
+    return {**{name: f'python docs/make_pictures.py {Path(name).stem}' for name in PICTURES},
+            **{path.relative_to(DOCS).as_posix(): command for pattern, (command, _) in
+               OTHERS.items() for path in sorted(DOCS.glob(pattern))}}
+
+
+def recorded() -> dict[str, str]:
+    """Digests of the inputs with which pictures were drawn."""
+    return json.loads(INPUTS.read_text(encoding='utf-8'))
+
+
+def stale() -> dict[str, str]:
+    """Pictures whose recorded digest is not that of their inputs, with their commands."""
+    known = recorded()
+    return {name: command for name, command in commands().items()
+            if known.get(name) != inputs(name)}
 
 
 def main(names):
-    """Draw pictures whose file or name is given, or all stale ones; record their inputs."""
-    for name in [name for name in PICTURES if Path(name).stem in names or not names
-                 and name in stale()]:
-        with matplotlib.rc_context(STYLE):
-            made = PICTURES[name][0]()
-            if isinstance(made, Figure):
-                made.savefig(DOCS / name, dpi=DOTS, pil_kwargs={'optimize': True})
-            elif isinstance(made, str):
-                (DOCS / name).write_text(made, encoding='utf-8')
-            else:
-                film.write(DOCS / name, made)
-        recorded = json.loads(INPUTS.read_text()) if INPUTS.is_file() else {}
-        INPUTS.write_text(json.dumps({one: inputs(one) if one == name else recorded.get(one)
-                                      for one in PICTURES}, indent=1) + '\n')
+    """Draw pictures whose name is given, or all stale ones; record the inputs of those drawn."""
+    for name, command in commands().items():
+        if Path(name).stem not in names and (names or name not in stale()):
+            continue
+        if name in PICTURES:
+            with matplotlib.rc_context({**STYLE, 'svg.fonttype': 'none', 'svg.hashsalt': name}):
+                made = PICTURES[name][0]()
+                if isinstance(made, Figure):
+                    made.savefig(DOCS / name, dpi=DOTS, **(
+                        {'metadata': {'Date': None}} if name.endswith('svg') else
+                        {'pil_kwargs': {'optimize': True}}))
+                else:
+                    film.write(DOCS / name, made)
+        elif not names:     # a name confirms that it was drawn
+            print(f'stale: {name}: {command}, then python docs/make_pictures.py {Path(name).stem}')
+            continue
+        INPUTS.write_text(json.dumps(recorded() | {name: inputs(name)}, indent=1) + '\n')
         print(DOCS / name)
 
 

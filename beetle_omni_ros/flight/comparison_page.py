@@ -52,7 +52,7 @@ def convergence(groups: Groups, task: str) -> Figure:
     """Errors in the 8 s of a pose: median and 10 to 90 % band over all poses."""
     figure, axes = panels(1, 2, height=2.8)
     grid = np.arange(0.0, POSE_DURATION, STEP)
-    for name, results in groups.items():
+    for k, (name, results) in enumerate(groups.items()):     # the first is on top
         style = look(name)
         for panel, (what, floor) in zip(axes[0], FLOOR.items(), strict=True):
             folded = _folded(results, f'{what}_error', grid)
@@ -61,7 +61,7 @@ def convergence(groups: Groups, task: str) -> Figure:
             low, middle, high = np.maximum(np.percentile(folded, (10, 50, 90), axis=0), floor)
             panel.fill_between(grid, low, high, color=style.colour, alpha=0.13, lw=0)
             panel.plot(grid, middle, color=style.colour, ls=style.dashes, lw=1.7,
-                       label=style.label, zorder=_height(name, groups))
+                       label=style.label, zorder=3 - k / len(groups))
     for panel, what in zip(axes[0], FLOOR, strict=True):
         for window, colour, name in ((L_WINDOW, '#eef1f5', 'L'), (U_WINDOW, '#d5e6d9', 'U')):
             panel.axvspan(*window, color=colour, lw=0, zorder=0)
@@ -95,19 +95,14 @@ def in_time(groups: Groups, task: str) -> Figure:
     for panel, what in zip(axes[:, 0], SHOWN, strict=True):
         if flown.kind in LEVELS:
             _levels(panel, flown)
-        highest = max(_error_curve(panel, results[0], what, name, _height(name, groups))
-                      for name, results in groups.items())
+        highest = max(_error_curve(panel, results[0], what, name, 3 - k / len(groups))
+                      for k, (name, results) in enumerate(groups.items()))
         panel.set_ylim(0, min(1.08 * highest, SHOWN[what]) or 1)
         panel.set_ylabel(f'{what} error [{UNITS[what]}]')
     axes[1, 0].set_xlim(POSE_DURATION - BEFORE, flown.duration)
     axes[1, 0].set_xlabel('time since the hover was asked for [s]')
     legend(figure, axes[0, 0])
     return figure
-
-
-def _height(name, groups):
-    """Order of drawing: the first controller is on top."""
-    return 3.0 - list(groups).index(name) / len(groups)
 
 
 def _levels(panel, task):

@@ -32,7 +32,6 @@ LINES: dict[str, tuple[str, str | tuple]] = {
     'nmpc_corrected': ('#b5651d', (0, (5, 1.2))),
     'nmpc_published': ('#e8960c', (0, (3, 1.2, 1, 1.2))),
     'hover': (GREY, (0, (1, 1.2)))}
-LEGEND_COLUMNS = 6
 
 STYLE: dict[Any, Any] = {
     'font.family': 'sans-serif', 'font.size': 9, 'axes.titlesize': 9.5, 'axes.titleweight': 'bold',
@@ -78,7 +77,7 @@ def legend(figure: Figure, axes: Axes) -> None:
     """Add one legend above the whole figure."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:     # in rows of equal length
-        rows = -(-len(labels) // LEGEND_COLUMNS)
+        rows = -(-len(labels) // 6)
         figure.legend(handles, labels, loc='outside upper left', ncols=-(-len(labels) // rows))
 
 
