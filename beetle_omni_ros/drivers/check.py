@@ -28,8 +28,7 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
     Check everything and print a table.
 
     The arguments are the options of `beetle_omni check`. ``listen`` observes the ROS graph for a
-    number of seconds; it raises ModuleNotFoundError without ROS. ``measure`` replaces all other
-    parts by the timing of this computer.
+    number of seconds, without ROS it raises ModuleNotFoundError. ``measure`` replaces all parts.
 
     Returns:
         exit status: 0 if nothing failed, else 1.

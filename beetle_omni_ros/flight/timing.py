@@ -53,11 +53,7 @@ def check_timing(robot: RobotParameters,
 
 
 def replay(log: FlightLog, host: ControllerHost, robot: RobotParameters) -> list[np.ndarray]:
-    """
-    Give readings to an estimator and a controller at the pace of their stamps.
-
-    Returned are durations by the wall clock and ends after the due time [s], (N, 2) of each.
-    """
+    """Replay at the stamps' pace: (N, 2) durations and ends after the due times [s] of each."""
     ekf = ErrorStateEkf(EkfParameters.load().of_robot(robot), robot.gravity)
     imu, every = log.imu, round(host.controller.period / PERIOD)
     poses = deque(map(PoseReading, log.mocap.t, log.mocap.position, log.mocap.quaternion))

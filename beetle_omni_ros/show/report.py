@@ -47,8 +47,7 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
 def make_runs(logs: dict[str, FlightLog]) -> list[Run]:
     """Compute the metrics of flights; give each the colour of its controller."""
     runs = []
-    colours = colours_of(logs.values())
-    for (name, log), colour in zip(logs.items(), colours, strict=True):
+    for (name, log), colour in zip(logs.items(), colours_of(logs.values()), strict=True):
         found = metrics_by_controller(log)
         runs.append(Run(name, colour, log, {
             f'{name}: {key}' if len(found) > 1 else name: result
