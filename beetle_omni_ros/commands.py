@@ -340,6 +340,9 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
           skip: Annotated[list[str], Option(metavar='servos|board|ros', help=(
               'Skip a part; may be repeated.'))] = (),
           namespace: NamespaceOption = '',
+          timing: Annotated[bool, Option('--timing', help=(
+              'Only measure the cycles of estimator and controllers on this computer; 1 min.'))
+              ] = False,
           json_path: JsonOption = None):
     """
     Check ports, devices and clocks of the real robot before flight.
@@ -352,9 +355,12 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
         return listen_to_ros(duration, namespace)
 
     from beetle_omni_ros.drivers.check import run_check
+    measure = None
+    if timing:
+        from beetle_omni_ros.flight.timing import check_timing as measure
     return run_check(listen=listen, servo_port=servo_port, board_port=board_port,
                      servo_bus=servo_bus, motor_board=motor_board, robot=robot, seconds=seconds,
-                     skip=tuple(skip), json_path=json_path)
+                     skip=tuple(skip), measure=measure, json_path=json_path)
 
 
 @app.command()
