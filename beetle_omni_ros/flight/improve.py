@@ -113,10 +113,11 @@ def compared(poses: dict[str, list[dict]]) -> dict:
 def is_worse(before: list[float | None], after: list[float | None]) -> bool:
     """Whether an error certainly increases by more than ``WORSE``, over poses of both flights."""
     pairs = np.array([pair for pair in zip(before, after, strict=True) if None not in pair])
-    if len(pairs) < 2:
+    if not len(pairs):
         return True         # nothing shows that it does not
     more = pairs[:, 1] - (1 + WORSE) * pairs[:, 0]
-    return bool(more.mean() > CERTAIN * more.std(ddof=1) / np.sqrt(len(more)))
+    spread = more.std(ddof=1) if len(more) > 1 else 0.0
+    return bool(more.mean() > CERTAIN * spread / np.sqrt(len(more)))
 
 
 def mean(values: list[float | None]) -> float | None:
