@@ -5,7 +5,7 @@ What the policy observes and commands belongs to the robot of the training. The 
 two models is between it and the flown robot:
 
 - Commands that act later: the policy observes the state that the model of the flown robot predicts
-  for the additional delay (Smith, Closer control of loops with dead time, 1957).
+  for the additional delay of tilts or thrusts (Smith, Closer control of loops with dead time, 1957).
 - Rotors and servos: thrusts and tilts of the flown robot move as those of the robot of the
   training. For thrusts f with the lag T, a scale s of the flown robot, and the lag T* of the
   training, the command is f + T / T* (u / s - f) for the policy's command u.
@@ -55,7 +55,9 @@ class ModelMatching:
             name: values for name, values in robot.effects.items() if name != 'joint_friction'})
         self._estimator = DisturbanceEstimator(robot, DisturbanceParameters(), command_delay,
                                                native.compiled(model.integrator(frictionless)))
-        known = max(command_delay + sum(trained.command_delays) / 2, 0.0)
+        # Of tilts and thrusts the later ones count: a loop forgives a command that acts earlier.
+        known, self._estimator.delay = (max(command_delay + max(each.command_delays), 0.0)
+                                        for each in (trained, robot))
         self._ahead = max(self._estimator.delay - known, 0.0)
         self._wrenches = native.buffered(native.compiled(wrenches(trained, robot)))
         self._scale = robot.thrust_scale / trained.thrust_scale
