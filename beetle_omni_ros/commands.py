@@ -22,6 +22,7 @@ from beetle_omni_ros.options import (
     DomainOption,
     FAILED,
     FaultsOption,
+    FullOption,
     JobsOption,
     JsonOption,
     KNOWN,
@@ -73,6 +74,7 @@ def fly(controller: ControllerOption = DEFAULT,
         domain_id: DomainOption = None,
         view: Annotated[bool, Option('--view', help=(
             'Show the flight in the browser, as beetle_omni view does.'))] = False,
+        full: FullOption = False,
         json_path: JsonOption = None):
     """
     Fly the simulated robot with the whole ROS graph in real time.
@@ -111,6 +113,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
                      'direct: commands go straight to the simulated plant; emulated: through '
                      'drivers, serial ports and emulated devices, in real time.'))] = 'direct',
              components: ComponentOption = None,
+             full: FullOption = False,
              json_path: JsonOption = None):
     """
     Fly a task in one process, deterministic and without a clock.
@@ -136,7 +139,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
     results = run_evaluate(controllers=controllers, task=task, conditions=conditions, robot=robot,
                            plant=plant, seed=seed, bag=bag, json_path=json_path,
                            faults=faults, actuators=actuators, components=components or (),
-                           options=options)
+                           options=options, full=full)
     return FAILED if any(map(failed, results.values())) else 0
 
 
@@ -216,6 +219,7 @@ def report(paths: Annotated[list[Path], Argument(metavar='RUN...', help=(
            output: Annotated[Path, Option(
                '--output', '-o', callback=writable, metavar='FILE', help='The page to write.')]
            = Path('report.html'),
+           full: FullOption = False,
            json_path: JsonOption = None):
     """
     Write one HTML page with metrics and plots of one or more runs.

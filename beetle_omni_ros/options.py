@@ -110,6 +110,8 @@ OutputOption = Annotated[Path | None, Option(
     '--output', '-o', metavar='DIR', help='Folder for page, pictures or Markdown, and JSON.')]
 JsonOption = Annotated[Path | None, Option(
     '--json', callback=writable, metavar='FILE', help='Write the results as JSON.')]
+FullOption = Annotated[bool, Option('--full', help=(
+    'Print the whole table: largest errors, effort, CPU times, parts of the task, every pose.'))]
 PageOption = Annotated[Path | None, Option(
     '--report', callback=writable, metavar='FILE', help=(
         'Write a self-contained HTML page with plots.'))]

@@ -98,7 +98,8 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
                  bag: Path | None = None, json_path: Path | None = None,
                  options: Mapping[str, ControllerOptions] = MappingProxyType({}),
                  faults: Path | None = None, actuators: str = 'direct',
-                 components: Sequence[str] = (), console: Console | None = None) -> dict:
+                 components: Sequence[str] = (), full: bool = False,
+                 console: Console | None = None) -> dict:
     """
     Fly a task with each controller and report; arguments as of `beetle_omni evaluate`.
 
@@ -155,7 +156,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             if interrupts:
                 meta['interrupted'] = True
                 break
-    table.print_results(results, console)
+    table.print_results(results, console, full=full)
     write_json(json_path, results)
     if interrupts:
         console.print(f"interrupted; kept {bag or 'the results above'}", soft_wrap=True)

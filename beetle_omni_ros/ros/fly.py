@@ -52,7 +52,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
             components: Sequence[str] = (), domain_id: int | None = None, view: bool = False,
-            console: Console | None = None) -> int:
+            full: bool = False, console: Console | None = None) -> int:
     """
     Fly a task through the ROS graph and print the results of the bag.
 
@@ -107,14 +107,14 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             failure, slow = _fly(graph, controller, flown_task, console, clock == 'simulated')
         except KeyboardInterrupt:
             meta['interrupted'] = True
-        return _conclude(bag, flown_task, meta, failure, slow, json_path, console)
+        return _conclude(bag, flown_task, meta, failure, slow, json_path, console, full)
 
 
 def _conclude(bag: Path, task: Task, meta: dict, failure: str, slow: str,
-              json_path: Path | None, console: Console) -> int:
+              json_path: Path | None, console: Console, full: bool) -> int:
     """Report the flight of a bag and why it failed; return the exit status."""
     if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
-        result = _report(bag, meta['controller'], task, meta, json_path, console)
+        result = _report(bag, meta['controller'], task, meta, json_path, console, full)
         failure = failure or failed(result)
     if 'interrupted' in meta:
         if bag.exists():
@@ -279,7 +279,7 @@ class Flight(Operator):
             raise RunError(status.message)
 
 
-def _report(bag, controller, task, meta, json_path, console) -> dict:
+def _report(bag, controller, task, meta, json_path, console, full) -> dict:
     if (bag / 'metadata.yaml').exists():
         add_meta(bag, meta)
     log = read_bag(bag)
@@ -287,6 +287,6 @@ def _report(bag, controller, task, meta, json_path, console) -> dict:
         _print(console, line, style='yellow')
     results = {'meta': meta, controller: metrics(log, task)}
     if log.targets:     # a controller flew
-        table.print_results(results, console)
+        table.print_results(results, console, full=full)
     write_json(json_path, results)
     return results[controller]

@@ -52,6 +52,7 @@ class Grid:
         faint_columns: indices of columns with published results.
         note: meaning of the columns, below the title.
         best: (row, column) of cells in bold.
+        unbroken: number of first columns that a terminal never breaks.
 
     """
 
@@ -62,18 +63,21 @@ class Grid:
     faint_columns: frozenset[int] = frozenset()
     note: str = ''
     best: frozenset[tuple[int, int]] = frozenset()
+    unbroken: int = 1
 
 
 def print_grids(shown: list[Grid], console: Console) -> None:
-    """Print tables; lines break between words only, and the first column never breaks."""
+    """Print tables; lines break between words only, and the first columns never."""
     for grid in shown:
         columns = list(zip(grid.header, *grid.rows, strict=True))
         table = Table(title=Text(grid.title) if grid.title else None, title_justify='left',
                       title_style='', box=None, min_width=min(len(grid.title), LONGEST_TITLE),
                       header_style='dim', padding=(0, SPACE, 0, 0))
         for k, (name, *cells) in enumerate(columns):
-            words = [word for cell in (name, *cells) for word in (cell.split() if k else [cell])]
-            table.add_column(Text(name), justify='right' if k else 'left', no_wrap=not k,
+            words = [word for cell in (name, *cells) for word in (
+                [cell] if k < grid.unbroken else cell.split())]
+            table.add_column(Text(name), justify='right' if k else 'left',
+                             no_wrap=k < grid.unbroken,
                              min_width=max(map(len, words), default=0),
                              style='dim' if k in grid.faint_columns else None)
         for k, row in enumerate(grid.rows):

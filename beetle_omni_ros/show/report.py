@@ -22,7 +22,7 @@ LEVELS = {1: 'warning', 2: 'error', 3: 'stale'}     # of diagnostics
 
 
 def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None,
-               console: Console | None = None) -> dict:
+               full: bool = False, console: Console | None = None) -> dict:
     """
     Read runs, print their result table, write the page; return :func:`results_of` the runs.
 
@@ -36,7 +36,7 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
             print(f'{log.source}: {warning}', file=sys.stderr)
     runs = make_runs(logs)
     results = results_of(runs)
-    table.print_results(results, console)
+    table.print_results(results, console, full=full)
     page = make_page(runs, results)
     write_text(output, page, 'report')
     write_json(json_path, results)
@@ -68,13 +68,13 @@ def results_of(runs: list[Run]) -> dict:
 
 def make_page(runs: list[Run], results: dict) -> str:
     """Return the HTML of the page."""
-    grids, meta = table.grids(results, with_poses=True), results['meta']
+    grids, meta = table.grids(results, full=True), results['meta']
     return rendered(
         'report.html', title='Flight report', cards=map(_card, runs), charts=charts.html(runs),
         subtitle=', '.join(filter(None, [table.title(meta),
                                          f"beetle_omni_ros {meta['version']}"])),
-        tables=[grid for grid in grids if grid.title != 'Poses'],
-        poses=[grid for grid in grids if grid.title == 'Poses'],
+        tables=[grid for grid in grids if not grid.title.startswith('Poses')],
+        poses=[grid for grid in grids if grid.title.startswith('Poses')],
         scene=recorded_scene({run.label: run.log for run in runs}),
         faults=[grid for run in runs for grid in _faults(run) if grid.rows])
 
