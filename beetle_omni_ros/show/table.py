@@ -203,12 +203,12 @@ def _summary(by_label, task, full):
         return [row(text, partial(_cell, path=path, digits=digits))
                 for text, path, digits in listed]
 
-    rows = [row('poses reached', _reached), *numbers(ERROR_ROWS)] if posed else []
+    rows = [row('poses reached', reached), *numbers(ERROR_ROWS)] if posed else []
     if any('landing' in column for column in columns):
         rows.append(row('landing [m/s]', lambda column: (
             'fell, ' if at(column, 'landing.fell') else '')
             + _cell(column, 'landing.speed_m_s', 2)))
-    rows.append(row('alarms', _alarms))
+    rows.append(row('alarms', alarms))
     if any(column.get('crashed') or 'ended' in column for column in columns):
         rows.append(row('ended early', lambda column: '; '.join(filter(None, (
             'crashed' if column.get('crashed') else '', column.get('ended')))) or ABSENT))
@@ -221,15 +221,16 @@ def _summary(by_label, task, full):
                 note=NOTE if posed else '')
 
 
-def _alarms(column):
-    """The first faults that the supervisor named, and the number of the others."""
+def alarms(column: dict) -> str:
+    """Return the first faults that the supervisor named, and the number of the others."""
     if 'alarms' not in column:
         return ABSENT
     first, others = list(column['alarms'])[:2], len(column['alarms']) - 2
     return ', '.join(map(shortened, first)) + f' +{others}' * (others > 0) or 'none'
 
 
-def _reached(column):
+def reached(column: dict) -> str:
+    """Return the number of reached poses, and of those in fallback."""
     if 'poses' not in column:
         return ABSENT
     poses = column['poses']
