@@ -39,6 +39,8 @@ lint: setup  ## style of every Python file, types of the core
 
 docs: setup  ## the site with reference pages from the code, all links checked; to build/site/
 	.venv/bin/python -m mkdocs build --strict
+	@echo 'files: build/site/index.html'
+	@echo 'next:  .venv/bin/python -m http.server --directory build/site'
 
 evaluate: setup  ## 100 random poses, in one process and faster than real time
 	@mkdir -p runs_out
@@ -62,6 +64,8 @@ gap: setup  ## hide a drag in the plant, fly, identify it, fly with the correcte
 	    --json $(GAP)/gap.json --report $(GAP)/gap.html $(ARGS)
 	for robot in params/robot.yaml $(GAP)/robot.yaml; do $(TOOL) evaluate --controllers nmpc \
 	    --task lemniscate --plant $(GAP)/plant.yaml --robot $$robot || exit; done
+	@echo 'files: $(GAP)/gap.html $(GAP)/robot.yaml'
+	@echo 'next:  open $(GAP)/gap.html in a browser'
 
 report: setup  ## one HTML page about the runs in runs_out/ (or RUNS='DIR...')
 	@runs='$(RUNS)'; for bag in runs_out/*/metadata.yaml; do \

@@ -91,8 +91,9 @@ def fly(controller: ControllerOption = DEFAULT,
 
 
 @app.command()
-def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,...', help=(
-                 f'Controllers to fly one after the other: {KNOWN}.'))] = DEFAULT,
+def evaluate(controllers: Annotated[str, Option(
+                 '--controllers', '--controller', callback=several, metavar='NAME,...', help=(
+                     f'Controllers to fly one after the other: {KNOWN}.'))] = DEFAULT,
              task: TaskOption = 'random100',
              conditions: ConditionsOption = 'nominal',
              seed: SeedOption = 0,
@@ -140,13 +141,16 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
                            plant=plant, seed=seed, bag=bag, json_path=json_path,
                            faults=faults, actuators=actuators, components=components or (),
                            options=options, full=full)
+    if bag is None:
+        echo('next:  the same with --bag DIR records the flight; with --full it prints everything')
     return FAILED if any(map(failed, results.values())) else 0
 
 
 @app.command()
-def compare(controllers: Annotated[str | None, Option(callback=several, metavar='NAME,...', help=(
-                f"Controllers: {KNOWN}. Default: {', '.join(registry.COMPARED)}; a missing "
-                'policy is left out.'))] = None,
+def compare(controllers: Annotated[str | None, Option(
+                '--controllers', '--controller', callback=several, metavar='NAME,...', help=(
+                    f"Controllers: {KNOWN}. Default: {', '.join(registry.COMPARED)}; a missing "
+                    'policy is left out.'))] = None,
             tasks: Annotated[str | None, Option(callback=several, metavar='TASK,...', help=(
                 'Names or pose files. Default: those of the publication.'))] = None,
             conditions: Annotated[str, Option(callback=several, metavar='NAME,...', help=(

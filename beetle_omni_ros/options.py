@@ -66,7 +66,7 @@ def whole(param: CallbackParam, text: str | None) -> list[int] | None:
 
 
 ControllerOption = Annotated[str, Option(
-    metavar='NAME', help=f'The active controller: {KNOWN}.')]
+    '--controller', '--controllers', metavar='NAME', help=f'The active controller: {KNOWN}.')]
 TaskOption = Annotated[str, Option(metavar='TASK', help=(
     'CSV file of poses, or waypoints, randomN (random100), lemniscate, lemniscate_large, hover, '
     'force, force_down, force_up, torque, torque_pulses, wind, pushes, payload or steps.'))]

@@ -1,10 +1,13 @@
 """Tables of text for the terminal, as Markdown and as HTML, and structure and style of pages."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from math import isfinite
 import os
+from pathlib import Path
+import shlex
 import sys
 
 from jinja2 import Environment, PackageLoader, select_autoescape
@@ -85,6 +88,15 @@ def print_grids(shown: list[Grid], console: Console) -> None:
         console.print(table, crop=False)
         if grid.note:
             console.print(grid.note, style='dim', highlight=False, markup=False)
+
+
+def print_end(console: Console, files: Iterable[Path | None], *then: str | Sequence) -> None:
+    """Print the files of a command that exist, and what to do or the commands to type next."""
+    lines = [f'files: {file}' for file in files if file and file.exists()]
+    lines += [f'next:  {one}' if isinstance(one, str) else
+              f"next:  {shlex.join(['beetle_omni', *map(str, one)])}" for one in then]
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def markdown(grid: Grid, numeric: bool = False) -> str:

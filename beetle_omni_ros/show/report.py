@@ -14,7 +14,7 @@ from beetle_omni_ros.model.schema import shortened
 from beetle_omni_ros.show import charts, table
 from beetle_omni_ros.show.charts import MAX_RUNS, Run
 from beetle_omni_ros.show.figures import COLOURS
-from beetle_omni_ros.show.page import Grid, rendered, Terminal
+from beetle_omni_ros.show.page import Grid, print_end, rendered, Terminal
 from beetle_omni_ros.show.recorded import recorded_scene
 
 MOST_ROWS = 40      # of states, faults and warnings
@@ -30,17 +30,16 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     many runs, or a page that cannot be written.
     """
     console = console or Terminal()
-    logs = read_flights(paths, MAX_RUNS)
-    for log in logs.values():
-        for warning in log.warnings:
-            print(f'{log.source}: {warning}', file=sys.stderr)
-    runs = make_runs(logs)
+    runs = make_runs(read_flights(paths, MAX_RUNS))
     results = results_of(runs)
-    table.print_results(results, console, full=full)
     page = make_page(runs, results)
+    for run in runs:
+        for warning in run.log.warnings:
+            print(f'{run.log.source}: {warning}', file=sys.stderr)
+    table.print_results(results, console, full=full)
     write_text(output, page, 'report')
     write_json(json_path, results)
-    console.print(f'{output}: {len(page) / 1e6:.1f} MB', highlight=False)
+    print_end(console, [output, json_path], f'open {output} in a browser', ('view', *paths))
     return results
 
 
