@@ -60,12 +60,7 @@ class Run:
 
 
 def figure(runs: list[Run], *names: str) -> go.Figure:
-    """
-    Return charts below each other with one time axis and one legend.
-
-    ``names`` are begins of the titles of charts; none: all charts. A ParameterError refuses
-    names without a chart.
-    """
+    """Return all charts below each other, or those whose titles begin with a name."""
     charts = [chart for chart in _charts(runs) if not names or chart[0].startswith(names)]
     if not charts:
         raise ParameterError(f"charts {', '.join(names)}: expected the begin of one of "

@@ -1,7 +1,6 @@
 """Result tables of flights."""
 
 from collections.abc import Callable
-from functools import partial
 
 from rich.console import Console
 
@@ -11,17 +10,15 @@ from beetle_omni_ros.show.page import ABSENT, Grid, number, print_grids, Termina
 
 FILES, SHIPPED_ROBOT = ('robot', 'plant'), 'params/robot.yaml'    # keys in the metadata
 
+POSE = '{:5.2f} {:5.2f} {:4.2f} {:4.0f} {:4.0f} {:4.0f}'
 NOTE = 'Means over the poses. U: 7.0 to 7.5 s after each target; L: 1 to 7 s after it.'
 ERROR_ROWS = (  # text, path in the metrics, digits
     ('error at the target, U [m]', 'mean.U_position_m', 4),
     ('error at the target, U [deg]', 'mean.U_orientation_deg', 2),
     ('error on the way, L [m]', 'mean.L_position_m', 3),
     ('error on the way, L [deg]', 'mean.L_orientation_deg', 2))
-LARGEST_ROWS = (
-    ('largest U [m]', 'max.U_position_m', 4),
-    ('largest U [deg]', 'max.U_orientation_deg', 2),
-    ('largest L [m]', 'max.L_position_m', 3),
-    ('largest L [deg]', 'max.L_orientation_deg', 2))
+LARGEST_ROWS = [(f'largest {text}', path.replace('mean', 'max'), digits)
+                for text, path, digits in ERROR_ROWS]
 EFFORT_ROWS = (
     ('|q* - q| [rad]', 'joint_error_mean_rad', 4),
     ('thrust [N]', 'thrust_mean_N', 2),
@@ -166,10 +163,9 @@ def grids(results: dict, *, full: bool = False) -> list[Grid]:
 
 def _in_order(others, by_label):
     """Published results in the order of the controllers that flew, the rest behind them."""
-    flown = [result.get('controller', label) for label, result in by_label.items()]
-    return dict(sorted(others.items(), key=lambda item: next(
-        (k for k, name in enumerate(flown) if item[0].lower().partition(',')[0] == name),
-        len(flown))))
+    flown = [*(result.get('controller', name) for name, result in by_label.items()), 'rl', 'nmpc']
+    return dict(sorted(others.items(),
+                       key=lambda item: flown.index(item[0].lower().partition(',')[0])))
 
 
 def _cell(part, path, digits):
@@ -195,26 +191,19 @@ def _summary(by_label, task, full):
     columns = [*by_label.values(), *others.values()]
     # The only pose of a trajectory is its start: to reach it says nothing about the path.
     posed = not all('trajectory' in result for result in by_label.values())
-
-    def row(text, shown):
-        return [text, *map(shown, columns)]
-
-    def numbers(listed):
-        return [row(text, partial(_cell, path=path, digits=digits))
-                for text, path, digits in listed]
-
-    rows = [row('poses reached', reached), *numbers(ERROR_ROWS)] if posed else []
+    shown: list[tuple] = [('poses reached', reached), *ERROR_ROWS] if posed else []
     if any('landing' in column for column in columns):
-        rows.append(row('landing [m/s]', lambda column: (
-            'fell, ' if at(column, 'landing.fell') else '')
-            + _cell(column, 'landing.speed_m_s', 2)))
-    rows.append(row('alarms', alarms))
+        shown.append(('landing [m/s]', lambda column: 'fell, ' * bool(at(column, 'landing.fell'))
+                      + _cell(column, 'landing.speed_m_s', 2)))
+    shown.append(('alarms', alarms))
     if any(column.get('crashed') or 'ended' in column for column in columns):
-        rows.append(row('ended early', lambda column: '; '.join(filter(None, (
-            'crashed' if column.get('crashed') else '', column.get('ended')))) or ABSENT))
+        shown.append(('ended early', lambda column: '; '.join(filter(None, (
+            'crashed' * bool(column.get('crashed')), column.get('ended')))) or ABSENT))
     if full:
-        rows += numbers((*(LARGEST_ROWS if posed else ()), *EFFORT_ROWS))
-        rows.append(row('guidance', lambda column: column.get('guidance') or ABSENT))
+        shown += [*(LARGEST_ROWS if posed else ()), *EFFORT_ROWS,
+                  ('guidance', lambda column: column.get('guidance') or ABSENT)]
+    rows = [[text, *(what[0](column) if callable(what[0]) else _cell(column, *what)
+                     for column in columns)] for text, *what in shown]
     first = len(by_label) + 1
     return Grid('', ['', *by_label, *(f'published {name}' for name in others)], rows,
                 faint_columns=frozenset(range(first, first + len(others))),
@@ -241,15 +230,13 @@ def reached(column: dict) -> str:
 
 def _poses(by_label):
     """Table with a row for each pose, a column for each result."""
-    targets = [[f'{v:.{digits}f}' for v, digits in zip(pose['target'], (2, 2, 2, 0, 0, 0))]
-               for pose in next(iter(by_label.values()))]
-    widths = [max(map(len, column)) for column in zip(*targets, strict=True)]
-    rows = [[str(k + 1), ' '.join(map(str.rjust, target, widths)), *(
-        f"{number(pose['U_position_m'], 4)} "
-        f"{number(angle := pose['U_orientation_deg'], 2 if (angle or 0.0) < 10 else 0)}"
-        + ' ✗' * (not pose['reached']) for pose in poses)]
-        for k, (target, poses) in enumerate(zip(targets, zip(*by_label.values(), strict=True),
-                                                strict=True))]
+    def cell(pose):
+        distance, angle = pose['U_position_m'], pose['U_orientation_deg']
+        return f'{number(distance, 4)} {number(angle, 2 if (angle or 0.0) < 10 else 0)}' \
+            + ' ✗' * (not pose['reached'])
+
+    rows = [[str(k + 1), POSE.format(*poses[0]['target']), *map(cell, poses)]
+            for k, poses in enumerate(zip(*by_label.values(), strict=True))]
     return Grid('Poses: U [m] and [deg]', ['', 'x y z [m] roll pitch yaw [deg]', *by_label], rows,
                 unbroken=2)
 

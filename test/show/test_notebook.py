@@ -1,7 +1,5 @@
 """A flight in a notebook: time from 0, the numbers of its bag, charts, table, page."""
 
-import sys
-
 from flown_once import flight
 import numpy as np
 import pytest
@@ -22,14 +20,11 @@ def log():
 def test_times_start_at_0_and_the_numbers_are_those_of_the_bag(log):
     bag = read_bag(flight('windy_0'))
     assert log.start == 0 < log.begin == pytest.approx(bag.begin - bag.start)
-    for moved, given in ((log.imu.t, bag.imu.t), (log.command.received, bag.command.received),
-                         (log.requests['hover'].t, bag.requests['hover'].t),
-                         (log.state_t, bag.state_t)):
+    for moved, given in ((log.command.received, bag.command.received), (log.state_t, bag.state_t),
+                         (log.requests['hover'].t, bag.requests['hover'].t)):
         assert np.allclose(moved + log.epoch, given, rtol=0, atol=1e-6)
     assert log.diagnostics[-1].t == bag.diagnostics[-1].t - bag.start
-    found, expected = log.metrics(), metrics(bag)
-    assert found['mean'] == pytest.approx(expected['mean'], rel=1e-6)
-    assert found['success_rate'] == expected['success_rate']
+    assert log.metrics()['mean'] == pytest.approx(metrics(bag)['mean'], rel=1e-6)
 
 
 def test_five_lines_describe_a_flight(log):
@@ -42,32 +37,18 @@ def test_five_lines_describe_a_flight(log):
 def test_charts_are_chosen_by_the_begin_of_their_titles(log):
     titles = [note.text for note in log.plot('position error', 'tilt').layout.annotations]
     assert titles == ['position error [m]', 'tilt command [rad]']
-    assert len(log.plot().data) > 20
     with pytest.raises(ParameterError, match='charts speed: expected the begin of one of pos'):
         log.plot('speed')
 
 
-def test_the_page_of_a_flight_is_written(log, tmp_path):
-    assert 'orientation error' in log.report(tmp_path / 'page.html').read_text()
-
-
 def test_a_table_has_the_newest_value_of_each_series_and_the_error(log):
     pytest.importorskip('pandas')
-    table, odom = log.to_pandas(), log.to_pandas('odom')
+    table = log.to_pandas()
     assert len(table) == len(log.truth)
-    assert odom['quaternion_w'].iloc[0] == log.odom.quaternion[0, 3]
-    time = table.index[2000]
-    newest = np.searchsorted(log.mocap.t, time, side='right') - 1
+    assert table['truth_quaternion_w'].iloc[0] == log.truth.quaternion[0, 3]
+    newest = np.searchsorted(log.mocap.t, table.index[2000], side='right') - 1
     assert table['mocap_position_z'].iloc[2000] == log.mocap.position[newest, 2]
     assert table['state'].iloc[2000] == 'flying:hover'
     assert np.isnan(table['error_m'][:log.begin - 0.01]).all()
     t, distance, _ = target_errors(log)
     assert table['error_m'][t[-1]] == distance[-1]
-    with pytest.raises(ParameterError, match="series 'rl': expected hover, truth"):
-        log.to_pandas('rl')
-
-
-def test_a_table_without_pandas_is_one_line_with_the_extra(log, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'pandas', None)
-    with pytest.raises(ModuleNotFoundError, match=r'^to_pandas needs pandas: .*\[notebook\]'):
-        log.to_pandas()
