@@ -29,7 +29,6 @@ from beetle_omni_ros.options import (
     NamespaceOption,
     NmpcOption,
     one_of,
-    OtherRobotOption,
     OutputOption,
     PageOption,
     PlantOption,
@@ -65,7 +64,6 @@ def fly(controller: ControllerOption = DEFAULT,
         plant: PlantOption = None,
         nmpc: NmpcOption = None,
         policy: PolicyOption = None,
-        allow_other_robot: OtherRobotOption = False,
         standby: Annotated[bool, Option('--standby/--alone', help=(
             'Run the other controllers on standby, to be selected in flight, or only the active '
             'controller.'))] = True,
@@ -101,7 +99,6 @@ def evaluate(controllers: Annotated[str, Option(
              plant: PlantOption = None,
              nmpc: NmpcOption = None,
              policy: PolicyOption = None,
-             allow_other_robot: OtherRobotOption = False,
              without: Annotated[str, Option(metavar='LAYER,...', help=(
                  'Layers of the guidance that are off: unwinding, routing, trimming, or '
                  'all.'))] = '',
@@ -126,8 +123,7 @@ def evaluate(controllers: Annotated[str, Option(
                            for name in controllers):
         raise ParameterError(f'--without {without}: no controller with guidance among '
                              f"{', '.join(controllers)}")
-    options = {name: ControllerOptions(allow_other_robot=allow_other_robot, without=without)
-               for name in controllers}
+    options = {name: ControllerOptions(without=without) for name in controllers}
     for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
         name = OWNER[option]
         if file and name not in controllers:
