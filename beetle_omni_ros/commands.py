@@ -12,6 +12,7 @@ from typer import Argument, echo, Option
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, OWNER
 from beetle_omni_ros.identify_commands import identify
+from beetle_omni_ros.improve import improve
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.options import (
     Commands,
@@ -295,6 +296,9 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
                    tolerances=tolerances, form=form, alpha=alpha)
 
 
+app.command()(improve)
+
+
 @app.command()
 def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
               'Folder for checkpoints, TensorBoard log and policy.onnx. Default: that of '
@@ -344,6 +348,9 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
           skip: Annotated[list[str], Option(metavar='servos|board|ros', help=(
               'Skip a part; may be repeated.'))] = (),
           namespace: NamespaceOption = '',
+          timing: Annotated[bool, Option('--timing', help=(
+              'Only measure the cycles of estimator and controllers on this computer; 1 min.'))
+              ] = False,
           json_path: JsonOption = None):
     """
     Check ports, devices and clocks of the real robot before flight.
@@ -356,9 +363,12 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
         return listen_to_ros(duration, namespace)
 
     from beetle_omni_ros.drivers.check import run_check
+    measure = None
+    if timing:
+        from beetle_omni_ros.flight.timing import check_timing as measure
     return run_check(listen=listen, servo_port=servo_port, board_port=board_port,
                      servo_bus=servo_bus, motor_board=motor_board, robot=robot, seconds=seconds,
-                     skip=tuple(skip), json_path=json_path)
+                     skip=tuple(skip), measure=measure, json_path=json_path)
 
 
 @app.command()

@@ -14,7 +14,7 @@ from beetle_omni_ros.bags.metrics import metrics
 from beetle_omni_ros.control.tasks import Task
 from beetle_omni_ros.model.files import write_text
 from beetle_omni_ros.show import charts, table
-from beetle_omni_ros.show.figures import COLOURS
+from beetle_omni_ros.show.figures import colours_of
 from beetle_omni_ros.show.page import number
 from beetle_omni_ros.show.report import make_page, make_runs, results_of
 
@@ -60,7 +60,7 @@ class NotebookLog(FlightLog):
 
     def plot(self, *names: str) -> Any:
         """Return a plotly figure of all charts, or of those whose titles begin with a name."""
-        return charts.figure([charts.Run(self._name(), COLOURS[0], self, {})], *names)
+        return charts.figure([charts.Run(self._name(), *colours_of([self]), self, {})], *names)
 
     def to_pandas(self) -> Any:
         """

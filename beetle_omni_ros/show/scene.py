@@ -114,8 +114,8 @@ class Robot:
     The robot with the ``number`` 0 has the colours of the model, the others are transparent.
     """
 
-    def __init__(self, scene, number: int):
-        tint = _colour(number) if number else None
+    def __init__(self, scene, number: int, colour: str):
+        tint = _rgb(colour) if number else None
         name = f'/robot{number}'
         self._root = scene.add_frame(name, show_axes=False, visible=False)
         self._joints, self._arrows, paths = {}, {}, {}
@@ -156,8 +156,8 @@ class Robot:
             self._label.text = text
 
 
-def _colour(number):
-    return tuple(bytes.fromhex(COLOURS[number][1:]))
+def _rgb(colour):
+    return tuple(bytes.fromhex(colour[1:]))
 
 
 def _arrow(begin, force):
@@ -166,9 +166,9 @@ def _arrow(begin, force):
 
 
 class Room:
-    """Floor, light, camera and robots."""
+    """Floor, light, camera and robots, one for each of the colours."""
 
-    def __init__(self, server: viser.ViserServer, robots: int = 1):
+    def __init__(self, server: viser.ViserServer, colours: Sequence[str] = COLOURS[:1]):
         scene = server.scene
         # Shadows and reflections would dominate the rendering time without a graphics card.
         scene.configure_default_lights(cast_shadow=False)
@@ -176,8 +176,8 @@ class Room:
         scene.add_light_ambient('/sky', intensity=SKY)
         scene.add_grid('/floor', FLOOR, FLOOR, cell_size=1.0, section_size=FLOOR,
                        infinite_grid=False, shadow_opacity=0.0)
-        self._server, self._scene = server, scene
-        self.robots = [Robot(scene, number) for number in range(robots)]
+        self._server, self._scene, self._colours = server, scene, colours
+        self.robots = [Robot(scene, number, colour) for number, colour in enumerate(colours)]
 
     def show(self, moments: Sequence[Moment | None], texts: Sequence[str]) -> None:
         """Draw all robots at one moment."""
@@ -195,7 +195,7 @@ class Room:
         """Draw the path (N, 3) [m] of a robot."""
         self._scene.add_line_segments(
             f'/path{number}', np.stack([positions[:-1], positions[1:]], axis=1),
-            _colour(number), thickness=1.5, thickness_units='screen')
+            _rgb(self._colours[number]), thickness=1.5, thickness_units='screen')
 
 
 def _add(scene, name, shape, colour, tint):
