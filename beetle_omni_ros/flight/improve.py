@@ -17,10 +17,10 @@ from beetle_omni_ros.show.page import Grid, number
 
 FILES = 'before', 'after'
 # Result -> label, factor of its unit, digits.
-ERRORS = {'U_position_m': ('error at the target, U [mm]', 1e3, 2),
-          'U_orientation_deg': ('error at the target, U [deg]', 1.0, 2),
-          'L_position_m': ('error on the way, L [mm]', 1e3, 1),
-          'L_orientation_deg': ('error on the way, L [deg]', 1.0, 2)}
+ERRORS = {'U_position_m': ('U position, mean [mm]', 1e3, 2),
+          'U_orientation_deg': ('U orientation, mean [deg]', 1.0, 2),
+          'L_position_m': ('L position, mean [mm]', 1e3, 1),
+          'L_orientation_deg': ('L orientation, mean [deg]', 1.0, 2)}
 WORSE = 0.05        # [1] increase of an error with which a file is not recommended
 CERTAIN = 1.645     # standard errors of the mean: 95 %, one-sided
 
