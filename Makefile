@@ -39,6 +39,8 @@ lint: setup  ## style of every Python file, types of the core
 
 docs: setup  ## the site with reference pages from the code, all links checked; to build/site/
 	.venv/bin/python -m mkdocs build --strict
+	@echo 'files: build/site/index.html'
+	@echo 'next:  .venv/bin/python -m http.server --directory build/site'
 
 evaluate: setup  ## 100 random poses, in one process and faster than real time
 	@mkdir -p runs_out

@@ -23,6 +23,7 @@ from beetle_omni_ros.options import (
     DomainOption,
     FAILED,
     FaultsOption,
+    FullOption,
     JobsOption,
     JsonOption,
     KNOWN,
@@ -72,6 +73,7 @@ def fly(controller: ControllerOption = DEFAULT,
         domain_id: DomainOption = None,
         view: Annotated[bool, Option('--view', help=(
             'Show the flight in the browser, as beetle_omni view does.'))] = False,
+        full: FullOption = False,
         json_path: JsonOption = None):
     """
     Fly the simulated robot with the whole ROS graph in real time.
@@ -88,8 +90,9 @@ def fly(controller: ControllerOption = DEFAULT,
 
 
 @app.command()
-def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,...', help=(
-                 f'Controllers to fly one after the other: {KNOWN}.'))] = DEFAULT,
+def evaluate(controllers: Annotated[str, Option(
+                 '--controllers', '--controller', callback=several, metavar='NAME,...', help=(
+                     f'Controllers to fly one after the other: {KNOWN}.'))] = DEFAULT,
              task: TaskOption = 'random100',
              conditions: ConditionsOption = 'nominal',
              seed: SeedOption = 0,
@@ -109,6 +112,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
                      'direct: commands go straight to the simulated plant; emulated: through '
                      'drivers, serial ports and emulated devices, in real time.'))] = 'direct',
              components: ComponentOption = None,
+             full: FullOption = False,
              json_path: JsonOption = None):
     """
     Fly a task in one process, deterministic and without a clock.
@@ -133,14 +137,17 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
     results = run_evaluate(controllers=controllers, task=task, conditions=conditions, robot=robot,
                            plant=plant, seed=seed, bag=bag, json_path=json_path,
                            faults=faults, actuators=actuators, components=components or (),
-                           options=options)
+                           options=options, full=full)
+    if bag is None:
+        echo('next:  the same with --bag DIR records the flight; with --full it prints everything')
     return FAILED if any(map(failed, results.values())) else 0
 
 
 @app.command()
-def compare(controllers: Annotated[str | None, Option(callback=several, metavar='NAME,...', help=(
-                f"Controllers: {KNOWN}. Default: {', '.join(registry.COMPARED)}; a missing "
-                'policy is left out.'))] = None,
+def compare(controllers: Annotated[str | None, Option(
+                '--controllers', '--controller', callback=several, metavar='NAME,...', help=(
+                    f"Controllers: {KNOWN}. Default: {', '.join(registry.COMPARED)}; a missing "
+                    'policy is left out.'))] = None,
             tasks: Annotated[str | None, Option(callback=several, metavar='TASK,...', help=(
                 'Names or pose files. Default: those of the publication.'))] = None,
             conditions: Annotated[str, Option(callback=several, metavar='NAME,...', help=(
@@ -213,6 +220,7 @@ def report(paths: Annotated[list[Path], Argument(metavar='RUN...', help=(
            output: Annotated[Path, Option(
                '--output', '-o', callback=writable, metavar='FILE', help='The page to write.')]
            = Path('report.html'),
+           full: FullOption = False,
            json_path: JsonOption = None):
     """
     Write one HTML page with metrics and plots of one or more runs.

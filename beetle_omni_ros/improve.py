@@ -26,8 +26,9 @@ def improve(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
                 'Flights for validation only. Default: the last of three bags or more.'))] = (),
             robot: TheRobotOption = None,
             plant: PlantOption = None,
-            controllers: Annotated[str, Option(callback=several, metavar='NAME,...', help=(
-                'Controllers that fly with both files.'))] = 'nmpc,rl',
+            controllers: Annotated[str, Option(
+                '--controllers', '--controller', callback=several, metavar='NAME,...',
+                help='Controllers that fly with both files.')] = 'nmpc,rl',
             task: TaskOption = 'random10',
             flights: Annotated[int, Option(min=1, metavar='N', help=(
                 'Flights of each controller with each file.'))] = 3,
@@ -66,5 +67,6 @@ def improve(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
         console.print(f"verdict {found['verdict']}: there is nothing to fly with",
                       highlight=False)
     write_json(output / 'improve.json', results)
-    console.print(f'all files are in {output}', highlight=False, soft_wrap=True)
+    shown = output / ('improve.html' if found['effects'] else 'gap.html')
+    page.print_end(console, [shown, output / 'improve.json'], f'open {shown} in a browser')
     return 3 if found['verdict'] == 'bad_data' else 0

@@ -66,7 +66,7 @@ def whole(param: CallbackParam, text: str | None) -> list[int] | None:
 
 
 ControllerOption = Annotated[str, Option(
-    metavar='NAME', help=f'The active controller: {KNOWN}.')]
+    '--controller', '--controllers', metavar='NAME', help=f'The active controller: {KNOWN}.')]
 TaskOption = Annotated[str, Option(metavar='TASK', help=(
     'CSV file of poses, or waypoints, randomN (random100), lemniscate, lemniscate_large, hover, '
     'force, force_down, force_up, torque, torque_pulses, wind, pushes, payload or steps.'))]
@@ -108,6 +108,8 @@ OutputOption = Annotated[Path | None, Option(
     '--output', '-o', metavar='DIR', help='Folder for page, pictures or Markdown, and JSON.')]
 JsonOption = Annotated[Path | None, Option(
     '--json', callback=writable, metavar='FILE', help='Write the results as JSON.')]
+FullOption = Annotated[bool, Option('--full', help=(
+    'Print the whole table: largest errors, effort, CPU times, parts of the task, every pose.'))]
 PageOption = Annotated[Path | None, Option(
     '--report', callback=writable, metavar='FILE', help=(
         'Write a self-contained HTML page with plots.'))]

@@ -80,7 +80,7 @@ CASES = {
         ('hover --nmpc horizon.yaml', '--nmpc horizon.yaml'),
         ('hover --policy policy.onnx', '--policy policy.onnx')],
     EVALUATE: [
-        ('--plant unknown.yaml', 'masss'),
+        ('--controller npmc', "'npmc': expected one of nmpc"), ('--plant unknown.yaml', 'masss'),
         ('--conditions windy', "--conditions 'windy': expected nominal or"),
         ('--sed 1', '--sed'), ('--seed', '--seed'), ('extra', 'extra'),
         ('--bag folder', 'folder: exists already; a bag needs a new folder'),
@@ -88,6 +88,7 @@ CASES = {
     FLY: [
         ('--task text.csv', 'row 3'), ('--robot unknown.yaml', 'masss'),
         ('--controller npmc', "controller 'npmc': expected one of nmpc"),
+        ('--controllers npmc', "controller 'npmc': expected one of nmpc"),
         ('--faults process.yaml', 'expected a fault of the robot'),
         ('--faults device.yaml --actuators emulated', 'expected --actuators direct'),
         ('--actuators steam', "actuators 'steam': expected emulated or direct"),

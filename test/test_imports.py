@@ -40,7 +40,7 @@ ALLOWED = {
 KEPT_IN = {'mujoco': 'sim', 'rclpy': 'ros', 'launch': 'ros', 'torch': 'train',
            'rsl_rl': 'train', 'tensordict': 'train', 'dynamixel_sdk': 'drivers',
            'pymavlink': 'drivers', 'serial': 'drivers', 'gymnasium': 'flight', 'viser': 'show',
-           'trimesh': 'show'}
+           'trimesh': 'show', 'pandas': 'show'}
 
 
 def imports(path):

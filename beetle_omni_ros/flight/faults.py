@@ -37,6 +37,7 @@ from beetle_omni_ros.show.page import (
     markdown,
     number,
     page,
+    print_end,
     print_grids,
     section,
     verdict_head,
@@ -228,7 +229,7 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
         write_text(output / PAGE, as_page(results, output), 'page')
         write_text(output / 'faults.md', as_markdown(results), 'page')
     print_grids([grid(results, narrow=True)], console)
-    for text in (total_text(results), f'page: {output / PAGE}' if output
-                 else 'no page written; --output DIR writes one'):
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
+    console.print(total_text(results), highlight=False, markup=False, soft_wrap=True)
+    print_end(console, [output and output / PAGE, json_path], f'open {output / PAGE} in a browser'
+              if output else 'the same with --output DIR writes a page')
     return results

@@ -17,7 +17,7 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task, Task
 from beetle_omni_ros.flight.component import ERROR
 from beetle_omni_ros.flight.loop import ARMING_TIME
-from beetle_omni_ros.model.files import write_json
+from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import find_robot, RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.ros import runner
@@ -31,12 +31,14 @@ from beetle_omni_ros.ros.graph import (
 )
 from beetle_omni_ros.ros.operator import NEVER, Operator
 from beetle_omni_ros.show import table
+from beetle_omni_ros.show.page import print_end
 from beetle_omni_ros.sim.faults import DEVICES, load_faults
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
 LANDING_TIMEOUT = 30.0  # s
 TICK = 0.005            # s between two attempts to arm in simulated time
+LOG = 'nodes.log'       # in the bag: what the nodes logged, in the order of time
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
 
 # s lost by the simulator above which a failure is attributed to the slow computer: the actuators
@@ -46,17 +48,17 @@ PACING = 'sim_node: pacing'
 
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
-            bag: Path | None = None, seed: int = 0, conditions: str = 'nominal',
+            bag: Path, seed: int = 0, conditions: str = 'nominal',
             actuators: str | None = None, clock: str = 'system',
             robot: Path | None = None, plant: Path | None = None, nmpc: Path | None = None,
             policy: Path | None = None, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
             components: Sequence[str] = (), domain_id: int | None = None, view: bool = False,
-            console: Console | None = None) -> int:
+            full: bool = False, console: Console | None = None) -> int:
     """
     Fly a task through the ROS graph and print the results of the bag.
 
-    Arguments are the options of `beetle_omni fly`; without ``bag`` the bag is deleted.
+    Arguments are the options of `beetle_omni fly`.
 
     Returns:
         Exit status: 0 flown to the end, 1 not.
@@ -69,7 +71,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
     with ExitStack() as stack:
         stack.enter_context(runner.sigterm_as_interrupt())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
-        bag = Path(bag).absolute() if bag else folder / 'bag'
+        given, bag = Path(bag), Path(bag).absolute()
         check_new(bag)
         flown_task = make_task(task, seed, registry.find(controller).reach(
             RobotParameters.load(robot)))
@@ -106,18 +108,33 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             failure, slow = _fly(graph, controller, flown_task, console, clock == 'simulated')
         except KeyboardInterrupt:
             meta['interrupted'] = True
-        return _conclude(bag, flown_task, meta, failure, slow, json_path, console)
+        log = given / LOG if bag.is_dir() else given.with_name(f'{bag.name}.log')
+        write_text(log, ''.join(f'{line}\n' for line in graph.lines()), 'log')
+        try:
+            return _conclude(bag, flown_task, meta, failure, slow, json_path, console, full)
+        finally:
+            print_end(console, [given, log, json_path],
+                      *([('report', given), ('view', given)] if bag.exists() else ()))
 
 
 def _conclude(bag: Path, task: Task, meta: dict, failure: str, slow: str,
-              json_path: Path | None, console: Console) -> int:
+              json_path: Path | None, console: Console, full: bool) -> int:
     """Report the flight of a bag and why it failed; return the exit status."""
     if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
-        result = _report(bag, meta['controller'], task, meta, json_path, console)
+        if (bag / 'metadata.yaml').exists():
+            add_meta(bag, meta)
+        log = read_bag(bag)
+        for line in log.warnings:
+            _print(console, line, style='yellow')
+        result = metrics(log, task)
+        results = {'meta': meta, meta['controller']: result}
+        if log.targets:     # a controller flew
+            table.print_results(results, console, full=full)
+        write_json(json_path, results)
         failure = failure or failed(result)
     if 'interrupted' in meta:
         if bag.exists():
-            _print(console, f'interrupted; kept {bag}')
+            _print(console, 'interrupted; kept what was flown')
         raise KeyboardInterrupt
     if failure:
         _complain(failure + slow)
@@ -276,16 +293,3 @@ class Flight(Operator):
         status = self.diagnostics.get('recorder_node: bag')
         if status is not None and status.level >= ERROR:
             raise RunError(status.message)
-
-
-def _report(bag, controller, task, meta, json_path, console) -> dict:
-    if (bag / 'metadata.yaml').exists():
-        add_meta(bag, meta)
-    log = read_bag(bag)
-    for line in log.warnings:
-        _print(console, line, style='yellow')
-    results = {'meta': meta, controller: metrics(log, task)}
-    if log.targets:     # a controller flew
-        table.print_results(results, console)
-    write_json(json_path, results)
-    return results[controller]

@@ -9,6 +9,7 @@ from collections.abc import MutableMapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from itertools import count
+from operator import itemgetter
 import os
 from pathlib import Path
 import re
@@ -317,15 +318,23 @@ class Graph:
             self.kill(name)
         return left
 
+    def lines(self) -> list[str]:
+        """Return the logged lines of all processes in the order of their times."""
+        timed, t = [], ''
+        for name in self.processes:
+            for line in self.log(name).read_text(errors='replace').splitlines():
+                # '[WARN] [1700000000.123456789] [node]: text', or a further line of it
+                t = line.partition('] [')[2].partition(']')[0] or t
+                timed.append((t, line))
+        return [line for _, line in sorted(timed, key=itemgetter(0))]
+
     def warnings(self) -> list[str]:
         """Return logged warnings and errors, without duplicates, in the order of their times."""
         lines: dict[str, str] = {}
-        for name in self.processes:
-            for line in self.log(name).read_text(errors='replace').splitlines():
-                if '[WARN]' in line or '[ERROR]' in line or ': error: ' in line:
-                    lines.setdefault(line.split(']: ', 1)[-1], line)
-        # '[WARN] [1700000000.123456789] [node]: text'
-        return sorted(lines.values(), key=lambda line: line.partition('] ')[2])
+        for line in self.lines():
+            if '[WARN]' in line or '[ERROR]' in line or ': error: ' in line:
+                lines.setdefault(line.split(']: ', 1)[-1], line)
+        return list(lines.values())
 
 
 def child_environment(domain: int) -> dict[str, str]:

@@ -21,7 +21,11 @@ LOCAL = '127.0.0.1'
 
 
 def recorded_scene(logs: Mapping[str, FlightLog]) -> str:
-    """Return the HTML of a player of flights by name, aligned by their first targets."""
+    """Make the HTML of a player of flights by name; a ParameterError refuses one without poses."""
+    for name, log in logs.items():
+        if not len(motion(log)):
+            raise ParameterError('; '.join([f'{name}: no pose of the robot; expected '
+                                            'ground_truth/odom or odom', *log.warnings]))
     begin = max(-BEFORE, min(motion(log).t[0] - log.begin for log in logs.values()))
     end = max(motion(log).t[-1] - log.begin for log in logs.values())
     step = max(1 / RATE, (end - begin) * len(logs) / MOST)

@@ -2,11 +2,10 @@
 
 from bisect import bisect_right
 from collections.abc import Sequence
-import contextlib
 from dataclasses import dataclass, field
-import io
 
 import numpy as np
+import rich
 import viser
 
 from beetle_omni_ros.bags.log import FlightLog, geodesic_angles, hold, motion
@@ -92,9 +91,9 @@ def wxyz(quaternion: np.ndarray) -> np.ndarray:
 
 def serve(host: str, port: int) -> viser.ViserServer:
     """Start a server at a port or the next free one; ParameterError: an unusable address."""
+    rich.get_console().quiet = True     # of viser, which prints its addresses, also in a notebook
     try:
-        with contextlib.redirect_stdout(io.StringIO()):     # viser prints its own addresses
-            server = viser.ViserServer(host, port, label='beetle_omni', verbose=False)
+        server = viser.ViserServer(host, port, label='beetle_omni', verbose=False)
     except (OSError, OverflowError, RuntimeError, UnicodeError) as error:
         raise ParameterError(f'--host {host} --port {port}: cannot be served there '
                              f'({error})') from None
@@ -104,8 +103,8 @@ def serve(host: str, port: int) -> viser.ViserServer:
 
 def close(server: viser.ViserServer) -> None:
     """Stop a server without its message."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
+    server.stop()
+    rich.get_console().quiet = False
 
 
 class Robot:
