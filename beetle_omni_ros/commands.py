@@ -56,10 +56,10 @@ def fly(controller: ControllerOption = DEFAULT,
             'emulated (default): commands go through joint_bridge_node, rotor_bridge_node, serial '
             'ports and emulated devices; direct: they go straight to the simulated '
             'plant.'))] = None,
-        clock: Annotated[str, Option(callback=one_of, metavar='system|simulated', help=(
+        clock: Annotated[str, Option(callback=one_of, metavar='auto|system|simulated', help=(
             'system: real time; simulated: simulated time on /clock, which waits for late nodes, '
-            'with direct actuators, for a computer that is too slow for real '
-            'time.'))] = 'system',
+            'with direct actuators; auto: simulated if this computer is too slow for real time, '
+            'measured before the start.'))] = 'auto',
         robot: RobotOption = None,
         plant: PlantOption = None,
         nmpc: NmpcOption = None,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, ExitStack
+from functools import partial
 from pathlib import Path
 import subprocess
 import sys
@@ -30,6 +31,7 @@ from beetle_omni_ros.ros.graph import (
     reserved_domain,
 )
 from beetle_omni_ros.ros.operator import NEVER, Operator
+from beetle_omni_ros.ros.pace import too_slow
 from beetle_omni_ros.show import table
 from beetle_omni_ros.sim.faults import DEVICES, load_faults
 
@@ -47,7 +49,7 @@ PACING = 'sim_node: pacing'
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             bag: Path | None = None, seed: int = 0, conditions: str = 'nominal',
-            actuators: str | None = None, clock: str = 'system',
+            actuators: str | None = None, clock: str = 'auto',
             robot: Path | None = None, plant: Path | None = None, nmpc: Path | None = None,
             policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
@@ -75,15 +77,18 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             RobotParameters.load(robot)))
         RobotParameters.load(plant or robot)
         injected = load_faults(faults) if faults else []
-        nodes, left_out = plan(
-            controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
+        planned = partial(
+            plan, controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
             standby=standby, allow_other_robot=allow_other_robot,
             robot_file=_absolute(robot and find_robot(robot)),
             plant_file=_absolute(plant and find_robot(plant)),
             conditions=conditions, seed=int(seed),
             task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-            ports=str(folder), clock=clock, actuators=_checked(injected, actuators),
-            components=components)
+            ports=str(folder), actuators=_checked(injected, actuators), components=components)
+        nodes, left_out = planned(clock='system' if clock == 'auto' else clock)
+        if clock == 'auto':
+            clock = _clock(nodes, robot, actuators, console)
+            nodes, left_out = planned(clock=clock)
         nodes['sim_node']['task_faults'] = '; '.join(map(str, injected))
         if clock == 'simulated':    # it begins when all nodes are there
             nodes['sim_node']['pause_at'] = 0.0
@@ -108,6 +113,20 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         except KeyboardInterrupt:
             meta['interrupted'] = True
         return _conclude(bag, flown_task, meta, failure, slow, json_path, console)
+
+
+def _clock(nodes, robot, actuators, console):
+    """Choose the clock of a flight by the pace of this computer, and say so in one line."""
+    with console.status('measuring the pace (the first time compiles the controller)'):
+        share, reason = too_slow(nodes, robot)
+    if not reason:
+        _print(console, f'real time: the flight needs {100 * share:.0f} % of a core')
+    elif actuators == 'emulated':
+        _print(console, f'{reason}; emulated devices have real time only', style='yellow')
+    else:
+        _print(console, f'{reason}; simulated time is used', style='yellow')
+        return 'simulated'
+    return 'system'
 
 
 def _conclude(bag: Path, task: Task, meta: dict, failure: str, slow: str,
