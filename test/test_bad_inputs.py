@@ -91,7 +91,7 @@ CASES = {
         ('--faults process.yaml', 'expected a fault of the robot'),
         ('--faults device.yaml --actuators emulated', 'expected --actuators direct'),
         ('--actuators steam', "actuators 'steam': expected emulated or direct"),
-        ('--clock sun', "clock 'sun': expected system or simulated"),
+        ('--clock sun', "clock 'sun': expected auto or system or simulated"),
         ('--domain-id 102', "'--domain-id': Input"),
         ('--clock simulated --actuators emulated', 'serial devices keep real')],
     COMPARE: [

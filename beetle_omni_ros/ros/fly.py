@@ -13,6 +13,7 @@ from rich.console import Console
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.bags.bag_writer import add_meta, check_new
+from beetle_omni_ros.bags.log import motion
 from beetle_omni_ros.bags.metrics import failed, metrics
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task, Task
@@ -45,6 +46,7 @@ SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as
 # stop after so long without a command.
 SLOW_TIME = 0.1
 PACING = 'sim_node: pacing'
+PICTURE = 'flight.png'      # of --view, in the folder of the bag
 
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
@@ -112,7 +114,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             failure, slow = _fly(graph, controller, flown_task, console, clock == 'simulated')
         except KeyboardInterrupt:
             meta['interrupted'] = True
-        return _conclude(bag, flown_task, meta, failure, slow, json_path, console)
+        return _conclude(bag, flown_task, meta, failure, slow, json_path, console, view)
 
 
 def _clock(nodes, robot, actuators, console):
@@ -130,10 +132,10 @@ def _clock(nodes, robot, actuators, console):
 
 
 def _conclude(bag: Path, task: Task, meta: dict, failure: str, slow: str,
-              json_path: Path | None, console: Console) -> int:
+              json_path: Path | None, console: Console, picture: bool = False) -> int:
     """Report the flight of a bag and why it failed; return the exit status."""
     if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
-        result = _report(bag, meta['controller'], task, meta, json_path, console)
+        result = _report(bag, meta['controller'], task, meta, json_path, console, picture)
         failure = failure or failed(result)
     if 'interrupted' in meta:
         if bag.exists():
@@ -298,7 +300,7 @@ class Flight(Operator):
             raise RunError(status.message)
 
 
-def _report(bag, controller, task, meta, json_path, console) -> dict:
+def _report(bag, controller, task, meta, json_path, console, picture) -> dict:
     if (bag / 'metadata.yaml').exists():
         add_meta(bag, meta)
     log = read_bag(bag)
@@ -308,4 +310,8 @@ def _report(bag, controller, task, meta, json_path, console) -> dict:
     if log.targets:     # a controller flew
         table.print_results(results, console)
     write_json(json_path, results)
+    if picture and len(motion(log)):
+        from beetle_omni_ros.show.picture import write_picture  # matplotlib takes a second
+        write_picture(log, bag / PICTURE, f'{controller}, {table.title(meta)}')
+        _print(console, f'picture: {bag / PICTURE}')
     return results[controller]
