@@ -32,6 +32,9 @@ FEW_POSES = 20          # up to this number, L and U windows are shaded
 MOST_MARKS = 12         # of faults in a chart, and states in a strip
 TINY = {'m': 1e-4, 'deg': 1e-2}     # floor of logarithmic errors
 L_COLOUR, U_COLOUR, GRID = '#eef1f5', '#cfe3d4', '#e6e9ed'
+# Colour -> the one on a dark page.
+NIGHT = {INK: '#dde2e8', L_COLOUR: '#252c35', U_COLOUR: '#254232', GRID: '#343b44',
+         '#1f5fa8': '#5d9fe8', '#7a52a3': '#ab86d3', '#b0447a': '#d873a5', '#5b6770': '#98a3af'}
 AXES = ('x [m]', 'y [m]', 'z [m]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]')
 STATE_COLOURS = {'flying': '#9cc7a8', 'takeoff': '#b9cfe6', 'landing': '#f0d29a',
                  'fallback': '#efb08a', 'emergency_stop': '#d9534f'}
@@ -91,7 +94,7 @@ def html(runs: list[Run]) -> str:
         if isinstance(trace['x'], dict) and trace['x']['dtype'] == 'f4':
             trace['x'] = times.setdefault(trace['x']['bdata'], len(times))
     return rendered('charts.html', plotly=get_plotlyjs(), figure={**found, 'times': list(times)},
-                    bins=BINS)
+                    bins=BINS, night=NIGHT)
 
 
 def _mark(figure, runs, row):
