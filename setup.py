@@ -91,6 +91,11 @@ GYM = [
     'gymnasium>=1.0,<2',
 ]
 
+# show/rerun_view.py alone.
+RERUN = [
+    'rerun-sdk>=0.34,<1',
+]
+
 # colcon looks for pytest under the name `test` before it runs pytest.
 TEST = [
     *GYM,
@@ -139,6 +144,7 @@ setup(
         'hardware': HARDWARE,
         'train': TRAIN,
         'gym': GYM,
+        'rerun': RERUN,
         'test': TEST,
         'dev': DEVELOPMENT,
     },

@@ -237,13 +237,17 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
              'Address at which the page is served; 0.0.0.0: to the whole network.'))]
          = '127.0.0.1',
          port: Annotated[int, Option(
-             metavar='N', min=1, max=65535, help='Port of the page.')] = 8080):
+             metavar='N', min=1, max=65535, help='Port of the page.')] = 8080,
+         rerun: Annotated[bool, Option('--rerun', help=(
+             'Open the runs in Rerun instead; needs the extra rerun.'))] = False):
     """
     Show a running graph or recorded runs in 3D in the browser.
 
     Prints the address of the page, which needs no network, and runs until Ctrl-C. Example:
     beetle_omni view my_run/rl my_run/nmpc
     """
+    if rerun and not runs:
+        raise ParameterError('--rerun: expected RUN with it, a recording')
     page = {'host': host, 'port': port}
     graph = {'namespace': namespace, 'domain_id': domain_id}
     if not runs:
@@ -254,6 +258,10 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
         if value not in ('', None):
             raise ParameterError(f"--{name.replace('_', '-')}: expected without RUN, which is a "
                                  'recording')
+    if rerun:
+        from beetle_omni_ros.show.rerun_view import run_rerun
+        run_rerun(runs)
+        return
     from beetle_omni_ros.show.recorded import run_view
     run_view(runs, **page)
 

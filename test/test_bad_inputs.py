@@ -117,7 +117,8 @@ CASES = {
         ('imu_only --output no/page.html', 'page.html')],
     'view': [
         ('none', 'none: no such bag'),
-        ('imu_only --namespace a', '--namespace: expected without')],
+        ('imu_only --namespace a', '--namespace: expected without'),
+        ('--rerun', '--rerun: expected RUN')],
     'gap': [
         ('', "'RUN...'"), ('none', 'none: no such bag'), ('imu_only imu_only', 'imu_only'),
         ('imu_only --robot unknown.yaml', 'masss'), ('imu_only --gap unknown.yaml', 'masss'),

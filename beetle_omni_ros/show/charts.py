@@ -80,7 +80,7 @@ def html(runs: list[Run]) -> str:
             _mark(figure, runs, row)
         figure.update_yaxes(type='log' if of_target or label.startswith('CPU') else '-',
                             row=row, col=1, zeroline=False, exponentformat='power')
-    figure.update_xaxes(gridcolor=GRID)
+    figure.update_xaxes(gridcolor=GRID, zeroline=False)
     figure.update_yaxes(gridcolor=GRID)
     figure.update_xaxes(title='time since the first target [s]', row=len(charts), col=1)
     figure.update_annotations(font={'size': 12, 'color': INK})

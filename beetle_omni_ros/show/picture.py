@@ -4,7 +4,6 @@ from pathlib import Path
 
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import Line3DCollection
 import numpy as np
 
 from beetle_omni_ros.bags.log import FlightLog, geodesic_angles, motion
@@ -12,7 +11,7 @@ from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.mode import FLYING
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.show.figures import COLOURS, FAINT, INK, PARTS, STYLE
-from beetle_omni_ros.show.scene import Moment, moments
+from beetle_omni_ros.show.scene import moments
 
 RATE = 20.0         # [Hz] of the lines
 MOST_ROBOTS = 10    # drawn along the path
@@ -56,23 +55,20 @@ def _draw_robots(axes, log, shown, flown):
         ends = np.linspace(t[0], t[-1], MOST_ROBOTS)
     rotors = RobotParameters.load().rotors.positions
     for k in np.unique(np.searchsorted(t, ends[:MOST_ROBOTS]).clip(0, len(t) - 1)):
-        axes.add_collection3d(_robot(flown[k][1], rotors))
+        _draw_robot(axes, flown[k][1], rotors)
     low, high = path.min(axis=0) - 0.4, path.max(axis=0) + 0.4
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(0, high[2]),
              xlabel='x [m]', ylabel='y [m]', zlabel='z [m]')
     axes.set_box_aspect((*(high - low)[:2], high[2]), zoom=1.15)
 
 
-def _robot(moment: Moment, rotors: np.ndarray) -> Line3DCollection:
+def _draw_robot(axes, moment, rotors):
     """Arms and tilted rotors."""
     turned = rotations.matrix(moment.quaternion)
-    lines, colours = [], []
     for rotor, tilt, colour in zip(rotors, moment.tilt, PARTS):
         arm = np.append(rotor[:2], 0) / np.linalg.norm(rotor[:2])
         side, up = np.cross([0, 0, 1], arm), np.array([0, 0, 1.0])
         lifted = np.cos(tilt) * side + np.sin(tilt) * up
         disc = rotor + RADIUS * (np.outer(np.cos(CIRCLE), arm) + np.outer(np.sin(CIRCLE), lifted))
-        lines += [moment.position + np.array([np.zeros(3), rotor]) @ turned.T,
-                  moment.position + disc @ turned.T]
-        colours += [INK, colour]
-    return Line3DCollection(lines, colors=colours, linewidths=1.1)
+        for line, shade in ((np.array([np.zeros(3), rotor]), INK), (disc, colour)):
+            axes.plot(*(moment.position + line @ turned.T).T, color=shade, linewidth=1.1)
