@@ -24,7 +24,7 @@ setup:  ## make .venv with all but training (also: PYTHON=..., EXTRAS=...)
 setup-train:  # the same with what training needs
 	@PYTHON='$(PYTHON)' .ci/setup train
 
-fly: setup  ## fly the waypoints through ROS nodes, seen in the browser; bag and picture in runs_out/
+fly: setup  ## fly the waypoints through ROS nodes, seen in the browser; bag and film in runs_out/
 	$(TOOL) fly --controller nmpc --task waypoints --view $(ARGS)
 
 test: setup-train  ## the whole test suite

@@ -19,7 +19,7 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task, Task
 from beetle_omni_ros.flight.component import ERROR
 from beetle_omni_ros.flight.loop import ARMING_TIME
-from beetle_omni_ros.model.files import write_json
+from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import find_robot, RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.ros import runner
@@ -46,7 +46,7 @@ SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as
 # stop after so long without a command.
 SLOW_TIME = 0.1
 PACING = 'sim_node: pacing'
-PICTURE = 'flight.png'      # of --view, in the folder of the bag
+FILM = 'flight.html'        # of --view, in the folder of the bag
 
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
@@ -132,10 +132,10 @@ def _clock(nodes, robot, actuators, console):
 
 
 def _conclude(bag: Path, task: Task, meta: dict, failure: str, slow: str,
-              json_path: Path | None, console: Console, picture: bool = False) -> int:
+              json_path: Path | None, console: Console, film: bool = False) -> int:
     """Report the flight of a bag and why it failed; return the exit status."""
     if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
-        result = _report(bag, meta['controller'], task, meta, json_path, console, picture)
+        result = _report(bag, meta['controller'], task, meta, json_path, console, film)
         failure = failure or failed(result)
     if 'interrupted' in meta:
         if bag.exists():
@@ -300,7 +300,7 @@ class Flight(Operator):
             raise RunError(status.message)
 
 
-def _report(bag, controller, task, meta, json_path, console, picture) -> dict:
+def _report(bag, controller, task, meta, json_path, console, film) -> dict:
     if (bag / 'metadata.yaml').exists():
         add_meta(bag, meta)
     log = read_bag(bag)
@@ -310,8 +310,8 @@ def _report(bag, controller, task, meta, json_path, console, picture) -> dict:
     if log.targets:     # a controller flew
         table.print_results(results, console)
     write_json(json_path, results)
-    if picture and len(motion(log)):
-        from beetle_omni_ros.show.picture import write_picture  # matplotlib takes a second
-        write_picture(log, bag / PICTURE, f'{controller}, {table.title(meta)}')
-        _print(console, f'picture: {bag / PICTURE}')
+    if film and len(motion(log)):
+        from beetle_omni_ros.show.recorded import recorded_scene  # viser takes a second
+        write_text(bag / FILM, recorded_scene({controller: log}), 'film')
+        _print(console, f'film: {bag / FILM}')
     return results[controller]

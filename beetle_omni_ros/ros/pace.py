@@ -1,6 +1,6 @@
 """Whether this computer can fly a graph in real time, measured before its start."""
 
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 import os
 from pathlib import Path
 from statistics import median
@@ -56,25 +56,18 @@ def _loop(nodes, robot):
 
 
 def _time_of_loop(loop):
-    """Time of a simulated second, the median of some windows in flight."""
-    times = []
-    with collector_off(), _priority_of_the_graph():
-        with suppress(RunError):    # the graph reports it
-            loop.take_off()
-        for _ in range(WINDOWS):
-            begin = time.perf_counter()
-            loop.run(WINDOW)
-            times.append(time.perf_counter() - begin)
-    return median(times) / WINDOW
-
-
-@contextmanager
-def _priority_of_the_graph():
-    """Real-time priority of this thread, if the system permits it."""
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    """Time of a simulated second in flight, at real-time priority if the system permits it."""
+    times, before = [], (os.sched_getscheduler(0), os.sched_getparam(0))
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(REAL_TIME_PRIORITY))
     try:
-        yield
+        with collector_off():
+            with suppress(RunError):    # the graph reports it
+                loop.take_off()
+            for _ in range(WINDOWS):
+                begin = time.perf_counter()
+                loop.run(WINDOW)
+                times.append(time.perf_counter() - begin)
     finally:
         os.sched_setscheduler(0, *before)
+    return median(times) / WINDOW

@@ -5,8 +5,6 @@ import os
 from pathlib import Path
 import tempfile
 
-import numpy as np
-
 from beetle_omni_ros.bags.bag import read_flights
 from beetle_omni_ros.bags.log import errors, FlightLog, motion
 from beetle_omni_ros.model.resources import PACKAGE, share_path
@@ -17,6 +15,12 @@ APPLICATION = 'beetle_omni'     # of the recordings and of viewers/rerun.rbl, wh
 PACKAGES = 'ROS_PACKAGE_PATH'   # where Rerun finds package:// of the meshes
 TIMELINE = 'message_log_time'   # of Rerun's MCAP reader
 ERRORS = {'error/position': 'position error [m]', 'error/orientation': 'orientation error [deg]'}
+# Title -> what is plotted: a topic, and a field of a JointState.
+PLOTS = {'tilt [rad]: measured and commanded': ['joint_states/position', 'command/position'],
+         'thrust command [N]': ['command/effort'], 'battery': ['battery_state'],
+         'IMU': ['imu/data_raw']}
+STATES = {'supervisor': 'supervisor/state', 'task': 'reference/state'}
+WORLD, TARGET, AXES = 'world', 'target', 0.28       # frames; [m]
 
 
 def run_rerun(runs: list[Path]) -> None:
@@ -39,10 +43,16 @@ def send(log: FlightLog, recording) -> None:
     import rerun
     for file in sorted(Path(log.source).glob('*.mcap')) or [Path(log.source)]:
         recording.log_file_from_path(file)
+    recording.log(TARGET, rerun.CoordinateFrame(TARGET), rerun.TransformAxes3D(AXES), static=True)
     body = motion(log)
     for target, after in zip(log.targets, [*log.targets[1:], None]):
         window = body.window(target.stamp, (after.stamp if after else log.end) - 1e-3)
         times = rerun.TimeColumn(TIMELINE, timestamp=body.t[window])
+        reference = target.at(target.stamp)
+        recording.set_time(TIMELINE, timestamp=target.stamp)
+        recording.log(TARGET, rerun.Transform3D(
+            translation=reference.position, quaternion=reference.quaternion,
+            parent_frame=WORLD, child_frame=TARGET))
         for name, values in zip(ERRORS, errors(body, target, window), strict=True):
             recording.send_columns(name, [times], rerun.Scalars.columns(scalars=values))
     recording.flush()
@@ -51,21 +61,17 @@ def send(log: FlightLog, recording) -> None:
 def blueprint():
     """Return the layout: robot, targets, errors, tilts, thrusts, sensors and states."""
     import rerun.blueprint as rrb
-    plots = [rrb.TimeSeriesView(origin='/', contents=[f'/{topic}' for topic in topics], name=title)
-             for title, topics in (
-                 *((title, [name]) for name, title in ERRORS.items()),
-                 ('tilt [rad]: measured and commanded',
-                  ['joint_states/position', 'command/position']),
-                 ('thrust command [N]', ['command/effort']),
-                 ('battery', ['battery_state']), ('IMU', ['imu/data_raw']))]
-    states = [rrb.TextDocumentView(origin=f'/{topic}', name=title) for topic, title in (
-        ('supervisor/state', 'supervisor'), ('reference/state', 'task'))]
+    lines = {title: [name] for name, title in ERRORS.items()} | PLOTS
+    plots = [rrb.TimeSeriesView(origin='/', contents=[f'/{name}' for name in names], name=title)
+             for title, names in lines.items()]
+    states = [rrb.TextDocumentView(origin=f'/{topic}', name=title)
+              for title, topic in STATES.items()]
     robot = rrb.Spatial3DView(
         origin='/', name='robot and target', contents=['+ /**', '- /**/collision_geometries/**'],
-        spatial_information=rrb.SpatialInformation(target_frame='world'))
-    return rrb.Blueprint(rrb.Horizontal(
-        rrb.Vertical(robot, rrb.Horizontal(*states), row_shares=[5, 1]), rrb.Vertical(*plots),
-        column_shares=[1, 1]), rrb.TimePanel(timeline=TIMELINE, expanded=False), collapse_panels=True)
+        spatial_information=rrb.SpatialInformation(target_frame=WORLD))
+    left = rrb.Vertical(robot, rrb.Horizontal(*states), row_shares=[5, 1])
+    return rrb.Blueprint(rrb.Horizontal(left, rrb.Vertical(*plots)),
+                         rrb.TimePanel(timeline=TIMELINE, expanded=False), collapse_panels=True)
 
 
 @contextmanager
@@ -73,9 +79,5 @@ def meshes():
     """Let Rerun find the meshes of this package while the context lasts."""
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / PACKAGE).symlink_to(share_path('description').parent)
-        before = os.environ.get(PACKAGES)
-        os.environ[PACKAGES] = os.pathsep.join(filter(None, [folder, before]))
-        try:
-            yield
-        finally:
-            os.environ.pop(PACKAGES) if before is None else os.environ.update({PACKAGES: before})
+        os.environ[PACKAGES] = os.pathsep.join(filter(None, [folder, os.environ.get(PACKAGES)]))
+        yield

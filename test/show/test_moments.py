@@ -43,7 +43,6 @@ def test_the_drawn_robot_tilts_and_its_arrows_are_as_long_as_the_thrusts(log):
         room.show([moment, None], 'here')
         drawn, hidden = room.robots
         np.testing.assert_allclose(room._world.position, -moment.position)
-        room.show([moment, None], 'here', follow=False)
         moment.position = moment.position + 1.0
         room.show([moment, None], 'here', follow=False)
         np.testing.assert_allclose(room._world.position, 1.0 - moment.position)
