@@ -72,8 +72,8 @@ def fly(controller: ControllerOption = DEFAULT,
         components: ComponentOption = None,
         domain_id: DomainOption = None,
         view: Annotated[bool, Option('--view', help=(
-            'Show the flight in the browser, as beetle_omni view does, and write a page that plays '
-            'it into the folder of the bag.'))] = False,
+            'Show the flight in the browser, as beetle_omni view does, and write a page that '
+            'plays it into the folder of the bag.'))] = False,
         json_path: JsonOption = None):
     """
     Fly the simulated robot with the whole ROS graph in real time.
