@@ -13,12 +13,10 @@ from beetle_omni_ros.ros import fly as fly_module
 from beetle_omni_ros.ros import pace
 from beetle_omni_ros.ros.graph import plan
 
-TWO_CORES = {0, 1}
-
 
 @pytest.mark.parametrize('cost, cores, text', [
-    (0.2, TWO_CORES, ''), (0.2, {0}, 'real time needs 2 cores, this computer has 1'),
-    (0.3, TWO_CORES, 'needs 120 % of a core, expected at most 95 %')])
+    (0.2, {0, 1}, ''), (0.2, {0}, 'real time needs 2 cores, this computer has 1'),
+    (0.3, {0, 1}, 'needs 120 % of a core, expected at most 95 %')])
 def test_a_slow_computer_or_one_core_is_named_and_a_stall_does_not_count(
         monkeypatch, cost, cores, text):
     clock, stalls = [0.0], [5.0]
