@@ -15,7 +15,7 @@ APPLICATION = 'beetle_omni'     # of the recordings and of viewers/rerun.rbl, wh
 PACKAGES = 'ROS_PACKAGE_PATH'   # where Rerun finds package:// of the meshes
 TIMELINE = 'message_log_time'   # of Rerun's MCAP reader
 ERRORS = {'error/position': 'position error [m]', 'error/orientation': 'orientation error [deg]'}
-# Title -> what is plotted: a topic, and a field of a JointState.
+# Title -> topics, with the field of a JointState.
 PLOTS = {'tilt [rad]: measured and commanded': ['joint_states/position', 'command/position'],
          'thrust command [N]': ['command/effort'], 'battery': ['battery_state'],
          'IMU': ['imu/data_raw']}
@@ -29,12 +29,13 @@ def run_rerun(runs: list[Path]) -> None:
         import rerun
     except ImportError:
         raise ParameterError("--rerun: needs Rerun: pip install 'rerun-sdk>=0.34,<1'") from None
+    if not any(map(os.environ.get, ('DISPLAY', 'WAYLAND_DISPLAY'))):     # it would wait for ever
+        raise ParameterError('--rerun: no display; expected DISPLAY or WAYLAND_DISPLAY')
     logs = read_flights(runs, len(COLOURS))
-    rerun.spawn(connect=False)
     with meshes():
         for name, log in logs.items():
             recording = rerun.RecordingStream(APPLICATION, recording_id=name)
-            recording.connect_grpc(default_blueprint=blueprint())
+            recording.spawn(default_blueprint=blueprint())     # reuses the first one's window
             send(log, recording)
 
 
