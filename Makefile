@@ -52,16 +52,14 @@ faults: setup  ## every listed fault from hover, on the move, upside down; to ru
 	@mkdir -p runs_out
 	$(TOOL) faults --output runs_out/faults $(ARGS)
 
-gap: setup  ## hide a drag in the plant, fly, identify it, fly with the corrected model; to runs_out/gap/
+gap: setup  ## hide a drag and slow rotors, fly, identify them, fly both controllers corrected; to runs_out/gap/
 	@rm -rf $(GAP) && mkdir -p $(GAP)
-	@printf 'extends: $(CURDIR)/params/robot.yaml\neffects: {rotor_drag: {coefficient: 1.2}}\n' \
+	@printf 'extends: $(CURDIR)/params/robot.yaml\neffects: {rotor_drag: {coefficient: 1.2}, rotor_lag: {time_constant: 0.13}}\n' \
 	    >$(GAP)/plant.yaml
 	for seed in 1 2 3; do $(TOOL) evaluate --controllers nmpc --task random8 --seed $$seed \
 	    --plant $(GAP)/plant.yaml --bag $(GAP)/flight$$seed || exit; done
-	$(TOOL) gap $(GAP)/flight1 $(GAP)/flight2 --holdout $(GAP)/flight3 --apply $(GAP)/robot.yaml \
-	    --json $(GAP)/gap.json --report $(GAP)/gap.html $(ARGS)
-	for robot in params/robot.yaml $(GAP)/robot.yaml; do $(TOOL) evaluate --controllers nmpc \
-	    --task lemniscate --plant $(GAP)/plant.yaml --robot $$robot || exit; done
+	$(TOOL) improve $(GAP)/flight1 $(GAP)/flight2 $(GAP)/flight3 --plant $(GAP)/plant.yaml \
+	    --output $(GAP) $(ARGS)
 
 report: setup  ## one HTML page about the runs in runs_out/ (or RUNS='DIR...')
 	@runs='$(RUNS)'; for bag in runs_out/*/metadata.yaml; do \

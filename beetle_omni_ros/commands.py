@@ -12,6 +12,7 @@ from typer import Argument, echo, Option
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, OWNER
 from beetle_omni_ros.identify_commands import identify
+from beetle_omni_ros.improve import improve
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.options import (
     Commands,
@@ -28,7 +29,6 @@ from beetle_omni_ros.options import (
     NamespaceOption,
     NmpcOption,
     one_of,
-    OtherRobotOption,
     OutputOption,
     PageOption,
     PlantOption,
@@ -64,7 +64,6 @@ def fly(controller: ControllerOption = DEFAULT,
         plant: PlantOption = None,
         nmpc: NmpcOption = None,
         policy: PolicyOption = None,
-        allow_other_robot: OtherRobotOption = False,
         standby: Annotated[bool, Option('--standby/--alone', help=(
             'Run the other controllers on standby, to be selected in flight, or only the active '
             'controller.'))] = True,
@@ -99,7 +98,6 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
              plant: PlantOption = None,
              nmpc: NmpcOption = None,
              policy: PolicyOption = None,
-             allow_other_robot: OtherRobotOption = False,
              without: Annotated[str, Option(metavar='LAYER,...', help=(
                  'Layers of the guidance that are off: unwinding, routing, trimming, or '
                  'all.'))] = '',
@@ -123,8 +121,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
                            for name in controllers):
         raise ParameterError(f'--without {without}: no controller with guidance among '
                              f"{', '.join(controllers)}")
-    options = {name: ControllerOptions(allow_other_robot=allow_other_robot, without=without)
-               for name in controllers}
+    options = {name: ControllerOptions(without=without) for name in controllers}
     for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
         name = OWNER[option]
         if file and name not in controllers:
@@ -300,6 +297,9 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
                    tolerances=tolerances, form=form, alpha=alpha)
 
 
+app.command()(improve)
+
+
 @app.command()
 def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
               'Folder for checkpoints, TensorBoard log and policy.onnx. Default: that of '
@@ -349,6 +349,9 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
           skip: Annotated[list[str], Option(metavar='servos|board|ros', help=(
               'Skip a part; may be repeated.'))] = (),
           namespace: NamespaceOption = '',
+          timing: Annotated[bool, Option('--timing', help=(
+              'Only measure the cycles of estimator and controllers on this computer; 1 min.'))
+              ] = False,
           json_path: JsonOption = None):
     """
     Check ports, devices and clocks of the real robot before flight.
@@ -361,9 +364,12 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
         return listen_to_ros(duration, namespace)
 
     from beetle_omni_ros.drivers.check import run_check
+    measure = None
+    if timing:
+        from beetle_omni_ros.flight.timing import check_timing as measure
     return run_check(listen=listen, servo_port=servo_port, board_port=board_port,
                      servo_bus=servo_bus, motor_board=motor_board, robot=robot, seconds=seconds,
-                     skip=tuple(skip), json_path=json_path)
+                     skip=tuple(skip), measure=measure, json_path=json_path)
 
 
 @app.command()

@@ -91,8 +91,6 @@ PolicyOption = Annotated[Path | None, Option(
     exists=True, dir_okay=False, metavar='FILE', help=(
         f"Policy (ONNX) for the controller '{registry.OWNER['--policy']}'. Default: the shipped "
         'one.'))]
-OtherRobotOption = Annotated[bool, Option('--allow-other-robot', help=(
-    'Fly a policy although it was trained for other robot parameters.'))]
 DomainOption = Annotated[int | None, Option(
     metavar='N', min=0, max=101, help='ROS domain. Default: ROS_DOMAIN_ID; of fly, a free one.')]
 NamespaceOption = Annotated[str, Option(

@@ -29,8 +29,9 @@ ALLOWED = {
     'start': (),
     'options': ('model', 'control'),
     'identify_commands': ('options', 'model', 'bags', 'identify'),
-    'commands': ('options', 'identify_commands', 'model', 'control', 'drivers', 'bags', 'show',
-                 'flight', 'identify', 'train', 'ros'),
+    'improve': ('options', 'model', 'show', 'flight', 'identify'),
+    'commands': ('options', 'identify_commands', 'improve', 'model', 'control', 'drivers',
+                 'bags', 'show', 'flight', 'identify', 'train', 'ros'),
     'cli': ('model', 'commands', 'options'),
     '__main__': ('cli',),
 }

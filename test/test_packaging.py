@@ -64,6 +64,7 @@ def dependencies(*tags):
 def test_name_version_and_licence_agree_everywhere(setup_arguments):
     assert MANIFEST.find('name').text == setup_arguments['name'] == PACKAGE
     assert MANIFEST.find('version').text == beetle_omni_ros.__version__
+    assert f'\nversion: {beetle_omni_ros.__version__}\n' in (ROOT / 'CITATION.cff').read_text()
     assert setup_arguments['version'] == beetle_omni_ros.__version__
     assert MANIFEST.find('license').text == setup_arguments['license'] == 'BSD-3-Clause'
     assert (ROOT / MANIFEST.find('license').get('file')).is_file()

@@ -29,6 +29,7 @@ from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import commit
 from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.show.figures import AMBER, GREEN, RED
 from beetle_omni_ros.show.page import (
     ABSENT,
     Grid,
@@ -47,7 +48,7 @@ from beetle_omni_ros.sim.faults import Case, chosen, load_cases
 NOTE = ('good: flights with the expected outcome or a better one. impact: speed of base_link at '
         'the fastest touchdown of a flight. named: median time until the supervisor detected a '
         'fault.')
-FAULT, PARTLY, SUCCESS = '#b3261e', '#d98a1c', '#2f8f5b'
+FAULT, PARTLY, SUCCESS = RED, AMBER, GREEN
 SOFTLY = f'{PLAN.impact_speed:g} m/s and {np.degrees(PLAN.inclination):.0f} deg'
 # Outcome -> meaning, the best outcome first.
 OUTCOMES = {

@@ -53,7 +53,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             bag: Path | None = None, seed: int = 0, conditions: str = 'nominal',
             actuators: str | None = None, clock: str = 'auto',
             robot: Path | None = None, plant: Path | None = None, nmpc: Path | None = None,
-            policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
+            policy: Path | None = None, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
             components: Sequence[str] = (), domain_id: int | None = None, view: bool = False,
             console: Console | None = None) -> int:
@@ -81,8 +81,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         injected = load_faults(faults) if faults else []
         planned = partial(
             plan, controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
-            standby=standby, allow_other_robot=allow_other_robot,
-            robot_file=_absolute(robot and find_robot(robot)),
+            standby=standby, robot_file=_absolute(robot and find_robot(robot)),
             plant_file=_absolute(plant and find_robot(plant)),
             conditions=conditions, seed=int(seed),
             task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),

@@ -50,8 +50,7 @@ def _loop(nodes, robot):
         elif NODES.get(name, CONTROLLER) == CONTROLLER:
             entry = registry.find(values.get('controller') or name.removesuffix('_node'))
             aboard[entry.name] = entry.make(robot, ControllerOptions(
-                parameters=values.get(f'{entry.name}_file'), policy=values.get('policy'),
-                allow_other_robot=values.get('allow_other_robot', False)))
+                parameters=values.get(f'{entry.name}_file'), policy=values.get('policy')))
     return FlightLoop(robot, robot, aboard, Recorder(), others=made(components, robot))
 
 

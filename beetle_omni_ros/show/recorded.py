@@ -10,7 +10,7 @@ import numpy as np
 from beetle_omni_ros.bags.bag import read_flights
 from beetle_omni_ros.bags.log import FlightLog, motion
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.show.figures import COLOURS
+from beetle_omni_ros.show.figures import COLOURS, colours_of
 from beetle_omni_ros.show.page import rendered
 from beetle_omni_ros.show.scene import close, drawable, moments, Room, serve
 from beetle_omni_ros.show.table import title
@@ -30,7 +30,7 @@ def recorded_scene(logs: Mapping[str, FlightLog]) -> str:
     times = np.arange(begin, end, step)
     server = serve(LOCAL, 8080)
     try:
-        room = Room(server, len(logs))
+        room = Room(server, colours_of(logs.values()))
         paths = [drawable(motion(log).position) for log in logs.values()]
         for number, path in enumerate(paths):
             room.draw_path(number, path[::max(1, len(path) // PATH_POINTS)])
@@ -48,7 +48,7 @@ def recorded_scene(logs: Mapping[str, FlightLog]) -> str:
     finally:
         close(server)
     head = rendered('viewer.html', title=title(next(iter(logs.values())).meta),
-                    runs=zip(logs, COLOURS))
+                    runs=zip(logs, colours_of(logs.values())))
     return page.replace('</head>', head + '</head>', 1)
 
 

@@ -13,7 +13,7 @@ from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.schema import shortened
 from beetle_omni_ros.show import charts, table
 from beetle_omni_ros.show.charts import MAX_RUNS, Run
-from beetle_omni_ros.show.figures import COLOURS
+from beetle_omni_ros.show.figures import colours_of
 from beetle_omni_ros.show.page import Grid, rendered, Terminal
 from beetle_omni_ros.show.recorded import recorded_scene
 
@@ -45,11 +45,11 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
 
 
 def make_runs(logs: dict[str, FlightLog]) -> list[Run]:
-    """Compute the metrics of flights; give each a colour."""
+    """Compute the metrics of flights; give each the colour of its controller."""
     runs = []
-    for k, (name, log) in enumerate(logs.items()):
+    for (name, log), colour in zip(logs.items(), colours_of(logs.values()), strict=True):
         found = metrics_by_controller(log)
-        runs.append(Run(name, COLOURS[k % MAX_RUNS], log, {
+        runs.append(Run(name, colour, log, {
             f'{name}: {key}' if len(found) > 1 else name: result
             for key, result in found.items()}))
     return runs

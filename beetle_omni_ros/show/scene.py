@@ -117,8 +117,8 @@ class Robot:
     The robot with the ``number`` 0 has the colours of the model, the others are transparent.
     """
 
-    def __init__(self, scene, number: int):
-        tint = _colour(number) if number else None
+    def __init__(self, scene, number: int, colour: str):
+        tint = _rgb(colour) if number else None
         name = f'{WORLD}/robot{number}'
         self._root = scene.add_frame(name, show_axes=False, visible=False)
         self._joints, self._arrows, paths = {}, {}, {}
@@ -155,8 +155,8 @@ class Robot:
         self._force.points = _arrow(moment.position, moment.force)
 
 
-def _colour(number):
-    return tuple(bytes.fromhex(COLOURS[number][1:]))
+def _rgb(colour):
+    return tuple(bytes.fromhex(colour[1:]))
 
 
 def _arrow(begin, force):
@@ -165,9 +165,9 @@ def _arrow(begin, force):
 
 
 class Room:
-    """Floor, light, camera, robots, and one text above the followed robot."""
+    """Floor, light, camera, robots of these colours, one text above the followed robot."""
 
-    def __init__(self, server: viser.ViserServer, robots: int = 1):
+    def __init__(self, server: viser.ViserServer, colours: Sequence[str] = COLOURS[:1]):
         scene, camera = server.scene, server.initial_camera
         # Shadows and reflections would dominate the rendering time without a graphics card.
         scene.configure_default_lights(cast_shadow=False)
@@ -179,9 +179,9 @@ class Room:
                        plane_color=(128, 134, 140), plane_opacity=0.25)
         self._label = scene.add_label('/label', '', anchor='bottom-center',
                                       position=(0.0, 0.0, LABEL_HEIGHT))
-        self._scene = scene
+        self._scene, self._colours = scene, colours
         camera.look_at, camera.position, camera.fov = np.zeros(3), VIEW_FROM, VIEW_ANGLE
-        self.robots = [Robot(scene, number) for number in range(robots)]
+        self.robots = [Robot(scene, number, colour) for number, colour in enumerate(colours)]
 
     def show(self, moments: Sequence[Moment | None], text: str, follow: bool = True) -> None:
         """Draw all robots at one moment; ``follow`` the first of them that has a pose."""
@@ -195,8 +195,8 @@ class Room:
     def draw_path(self, number: int, positions: np.ndarray):
         """Draw the path (N, 3) [m] of a robot; returns its handle, whose ``points`` may change."""
         return self._scene.add_line_segments(
-            f'{WORLD}/path{number}', segments(positions), _colour(number), thickness=1.5,
-            thickness_units='screen')
+            f'{WORLD}/path{number}', segments(positions), _rgb(self._colours[number]),
+            thickness=1.5, thickness_units='screen')
 
 
 def segments(positions: np.ndarray) -> np.ndarray:

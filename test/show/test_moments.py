@@ -10,6 +10,7 @@ from beetle_omni_ros.bags.log import LogRecorder
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.parameters import JOINT_NAMES
+from beetle_omni_ros.show.figures import COLOURS
 from beetle_omni_ros.show.live import draw
 from beetle_omni_ros.show.recorded import recorded_scene
 from beetle_omni_ros.show.scene import close, moments, NEWTON_PER_METRE, Room, serve
@@ -37,7 +38,7 @@ def test_moments_agree_with_the_log(log):
 def test_the_drawn_robot_tilts_and_its_arrows_are_as_long_as_the_thrusts(log):
     server = serve('127.0.0.1', 8300)
     try:
-        room = Room(server, 2)
+        room = Room(server, COLOURS[:2])
         moment, = moments(log, np.array([55.0]))
         moment.tilt, moment.thrust = np.array([0.3, -1.2, 2.5, 0.0]), np.array([8.0, 4.0, 0.0, 1])
         room.show([moment, None], 'here')
