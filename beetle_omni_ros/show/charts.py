@@ -20,7 +20,7 @@ from beetle_omni_ros.bags.log import (
 from beetle_omni_ros.bags.metrics import L_WINDOW, U_WINDOW
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.model.schema import shortened
-from beetle_omni_ros.show.figures import COLOURS, FAINT, INK, PARTS
+from beetle_omni_ros.show.figures import BLUE, COLOURS, FAINT, GREY, INK, PARTS, RED, VIOLET
 from beetle_omni_ros.show.page import rendered
 
 MAX_RUNS = len(COLOURS)     # each run has its own colour
@@ -34,7 +34,7 @@ TINY = {'m': 1e-4, 'deg': 1e-2}     # floor of logarithmic errors
 L_COLOUR, U_COLOUR, GRID = '#eef1f5', '#cfe3d4', '#e6e9ed'
 # Colour -> the one on a dark page.
 NIGHT = {INK: '#dde2e8', L_COLOUR: '#252c35', U_COLOUR: '#254232', GRID: '#343b44',
-         '#1f5fa8': '#5d9fe8', '#7a52a3': '#ab86d3', '#b0447a': '#d873a5', '#5b6770': '#98a3af'}
+         BLUE: '#5d9fe8', RED: '#f0665c', VIOLET: '#ab86d3', GREY: '#98a3af'}
 AXES = ('x [m]', 'y [m]', 'z [m]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]')
 STATE_COLOURS = {'flying': '#9cc7a8', 'takeoff': '#b9cfe6', 'landing': '#f0d29a',
                  'fallback': '#efb08a', 'emergency_stop': '#d9534f'}
