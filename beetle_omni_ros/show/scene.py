@@ -177,7 +177,7 @@ class Room:
         scene.add_grid(f'{WORLD}/floor', FLOOR, FLOOR, cell_size=1.0, section_size=FLOOR,
                        fade_distance=HORIZON, shadow_opacity=0.0, cell_color=(150, 158, 166),
                        plane_color=(128, 134, 140), plane_opacity=0.25)
-        self._label = scene.add_label('/label', '', anchor='bottom-center', visible=False,
+        self._label = scene.add_label('/label', '', anchor='bottom-center',
                                       position=(0.0, 0.0, LABEL_HEIGHT))
         self._scene, self._colours = scene, colours
         camera.look_at, camera.position, camera.fov = np.zeros(3), VIEW_FROM, VIEW_ANGLE
@@ -190,7 +190,7 @@ class Room:
         if follow and (first := next(filter(None, moments), None)):
             self._world.position = -first.position
         if self._label.text != text:
-            self._label.text, self._label.visible = text, True  # a player hides it at its begin
+            self._label.text = text
 
     def draw_path(self, number: int, positions: np.ndarray):
         """Draw the path (N, 3) [m] of a robot; returns its handle, whose ``points`` may change."""
