@@ -24,8 +24,8 @@ setup:  ## make .venv with all but training (also: PYTHON=..., EXTRAS=...)
 setup-train:  # the same with what training needs
 	@PYTHON='$(PYTHON)' .ci/setup train
 
-fly: setup  ## fly the waypoints in real time through ROS nodes; the bag is in runs_out/
-	$(TOOL) fly --controller nmpc --task waypoints $(ARGS)
+fly: setup  ## fly the waypoints through ROS nodes, seen in the browser; bag and film in runs_out/
+	$(TOOL) fly --controller nmpc --task waypoints --view $(ARGS)
 
 test: setup-train  ## the whole test suite
 	@.ci/test $(ARGS)

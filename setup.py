@@ -97,6 +97,11 @@ NOTEBOOK = [
     'pandas>=2,<4',
 ]
 
+# show/rerun_view.py alone.
+RERUN = [
+    'rerun-sdk>=0.34,<1',
+]
+
 # colcon looks for pytest under the name `test` before it runs pytest.
 TEST = [
     *GYM,
@@ -147,6 +152,7 @@ setup(
         'train': TRAIN,
         'gym': GYM,
         'notebook': NOTEBOOK,
+        'rerun': RERUN,
         'test': TEST,
         'dev': DEVELOPMENT,
     },

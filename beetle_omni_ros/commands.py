@@ -57,10 +57,10 @@ def fly(controller: ControllerOption = DEFAULT,
             'emulated (default): commands go through joint_bridge_node, rotor_bridge_node, serial '
             'ports and emulated devices; direct: they go straight to the simulated '
             'plant.'))] = None,
-        clock: Annotated[str, Option(callback=one_of, metavar='system|simulated', help=(
+        clock: Annotated[str, Option(callback=one_of, metavar='auto|system|simulated', help=(
             'system: real time; simulated: simulated time on /clock, which waits for late nodes, '
-            'with direct actuators, for a computer that is too slow for real '
-            'time.'))] = 'system',
+            'with direct actuators; auto: simulated if this computer is too slow for real time, '
+            'measured before the start.'))] = 'auto',
         robot: RobotOption = None,
         plant: PlantOption = None,
         nmpc: NmpcOption = None,
@@ -72,7 +72,8 @@ def fly(controller: ControllerOption = DEFAULT,
         components: ComponentOption = None,
         domain_id: DomainOption = None,
         view: Annotated[bool, Option('--view', help=(
-            'Show the flight in the browser, as beetle_omni view does.'))] = False,
+            'Show the flight in the browser, as beetle_omni view does, and write a page that '
+            'plays it into the folder of the bag.'))] = False,
         full: FullOption = False,
         json_path: JsonOption = None):
     """
@@ -241,13 +242,17 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
              'Address at which the page is served; 0.0.0.0: to the whole network.'))]
          = '127.0.0.1',
          port: Annotated[int, Option(
-             metavar='N', min=1, max=65535, help='Port of the page.')] = 8080):
+             metavar='N', min=1, max=65535, help='Port of the page.')] = 8080,
+         rerun: Annotated[bool, Option('--rerun', help=(
+             'Open the runs in Rerun instead; needs the extra rerun.'))] = False):
     """
     Show a running graph or recorded runs in 3D in the browser.
 
     Prints the address of the page, which needs no network, and runs until Ctrl-C. Example:
     beetle_omni view my_run/rl my_run/nmpc
     """
+    if rerun and not runs:
+        raise ParameterError('--rerun: expected RUN with it, a recording')
     page = {'host': host, 'port': port}
     graph = {'namespace': namespace, 'domain_id': domain_id}
     if not runs:
@@ -258,6 +263,10 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
         if value not in ('', None):
             raise ParameterError(f"--{name.replace('_', '-')}: expected without RUN, which is a "
                                  'recording')
+    if rerun:
+        from beetle_omni_ros.show.rerun_view import run_rerun
+        run_rerun(runs)
+        return
     from beetle_omni_ros.show.recorded import run_view
     run_view(runs, **page)
 

@@ -92,7 +92,7 @@ CASES = {
         ('--faults process.yaml', 'expected a fault of the robot'),
         ('--faults device.yaml --actuators emulated', 'expected --actuators direct'),
         ('--actuators steam', "actuators 'steam': expected emulated or direct"),
-        ('--clock sun', "clock 'sun': expected system or simulated"),
+        ('--clock sun', "clock 'sun': expected auto or system or simulated"),
         ('--domain-id 102', "'--domain-id': Input"),
         ('--clock simulated --actuators emulated', 'serial devices keep real')],
     COMPARE: [
@@ -118,7 +118,8 @@ CASES = {
         ('imu_only --output no/page.html', 'page.html')],
     'view': [
         ('none', 'none: no such bag'),
-        ('imu_only --namespace a', '--namespace: expected without')],
+        ('imu_only --namespace a', '--namespace: expected without'),
+        ('--rerun', '--rerun: expected RUN')],
     'gap': [
         ('', "'RUN...'"), ('none', 'none: no such bag'), ('imu_only imu_only', 'imu_only'),
         ('imu_only --robot unknown.yaml', 'masss'), ('imu_only --gap unknown.yaml', 'masss'),

@@ -21,7 +21,7 @@ HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 # Import name -> distribution on PyPI, where they differ; import name -> rosdep key.
 DISTRIBUTION = {'yaml': 'pyyaml', 'serial': 'pyserial', 'dynamixel_sdk': 'dynamixel-sdk',
-                'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow'}
+                'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow', 'rerun': 'rerun-sdk'}
 KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'casadi': 'casadi-pip',
        'serial': 'python3-serial', 'PIL': 'python3-pil'}
 
@@ -105,7 +105,7 @@ def test_data_files_are_in_the_folders_of_ros(setup_arguments):
 def test_every_import_is_a_declared_requirement(setup_arguments):
     extras = setup_arguments['extras_require']
     lines = [*setup_arguments['install_requires'],
-             *(line for extra in ('hardware', 'train', 'gym', 'notebook')
+             *(line for extra in ('hardware', 'train', 'gym', 'notebook', 'rerun')
                for line in extras[extra])]
     declared = {re.split(r'[\[<>=~;! ]', line)[0] for line in lines}
     keys = dependencies('exec_depend', 'depend')
@@ -116,7 +116,7 @@ def test_every_import_is_a_declared_requirement(setup_arguments):
             assert module in keys, f'{module}: not in package.xml'
             continue
         assert DISTRIBUTION.get(module, module) in declared, f'{module}: not in setup.py'
-        if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'gymnasium', 'pandas'):
+        if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'gymnasium', 'pandas', 'rerun'):
             candidates = {KEY.get(module), f'python3-{module}', f'python3-{module}-pip', module}
             assert keys & candidates or module in without_key, f'{module}: no rosdep key'
 

@@ -5,7 +5,8 @@ What the policy observes and commands belongs to the robot of the training. The 
 two models is between it and the flown robot:
 
 - Commands that act later: the policy observes the state that the model of the flown robot predicts
-  for the additional delay of tilts or thrusts (Smith, Closer control of loops with dead time, 1957).
+  for the additional delay of tilts or thrusts (Smith, Closer control of loops with dead time,
+  1957).
 - Rotors and servos: thrusts and tilts of the flown robot move as those of the robot of the
   training. For thrusts f with the lag T, a scale s of the flown robot, and the lag T* of the
   training, the command is f + T / T* (u / s - f) for the policy's command u.

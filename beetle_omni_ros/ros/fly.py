@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, ExitStack
+from functools import partial
 from pathlib import Path
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from rich.console import Console
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.bags.bag_writer import add_meta, check_new
+from beetle_omni_ros.bags.log import motion
 from beetle_omni_ros.bags.metrics import failed, metrics
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task, Task
@@ -30,6 +32,7 @@ from beetle_omni_ros.ros.graph import (
     reserved_domain,
 )
 from beetle_omni_ros.ros.operator import NEVER, Operator
+from beetle_omni_ros.ros.pace import too_slow
 from beetle_omni_ros.show import table
 from beetle_omni_ros.show.page import print_end
 from beetle_omni_ros.sim.faults import DEVICES, load_faults
@@ -45,11 +48,12 @@ SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as
 # stop after so long without a command.
 SLOW_TIME = 0.1
 PACING = 'sim_node: pacing'
+FILM = 'flight.html'        # of --view, in the folder of the bag
 
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             bag: Path, seed: int = 0, conditions: str = 'nominal',
-            actuators: str | None = None, clock: str = 'system',
+            actuators: str | None = None, clock: str = 'auto',
             robot: Path | None = None, plant: Path | None = None, nmpc: Path | None = None,
             policy: Path | None = None, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
@@ -77,14 +81,17 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             RobotParameters.load(robot)))
         RobotParameters.load(plant or robot)
         injected = load_faults(faults) if faults else []
-        nodes, left_out = plan(
-            controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
+        planned = partial(
+            plan, controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
             standby=standby, robot_file=_absolute(robot and find_robot(robot)),
             plant_file=_absolute(plant and find_robot(plant)),
             conditions=conditions, seed=int(seed),
             task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-            ports=str(folder), clock=clock, actuators=_checked(injected, actuators),
-            components=components)
+            ports=str(folder), actuators=_checked(injected, actuators), components=components)
+        nodes, left_out = planned(clock='system' if clock == 'auto' else clock)
+        if clock == 'auto':
+            clock = _clock(nodes, robot, actuators, console)
+            nodes, left_out = planned(clock=clock)
         nodes['sim_node']['task_faults'] = '; '.join(map(str, injected))
         if clock == 'simulated':    # it begins when all nodes are there
             nodes['sim_node']['pause_at'] = 0.0
@@ -111,26 +118,32 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         log = given / LOG if bag.is_dir() else given.with_name(f'{bag.name}.log')
         write_text(log, ''.join(f'{line}\n' for line in graph.lines()), 'log')
         try:
-            return _conclude(bag, flown_task, meta, failure, slow, json_path, console, full)
+            return _conclude(bag, flown_task, meta, failure, slow, json_path, console, full, view)
         finally:
-            print_end(console, [given, log, json_path],
+            film = given / FILM
+            print_end(console, [given, log, *([film] if film.exists() else []), json_path],
                       *([('report', given), ('view', given)] if bag.exists() else ()))
 
 
+def _clock(nodes, robot, actuators, console):
+    """Choose the clock of a flight by the pace of this computer, and say so in one line."""
+    with console.status('measuring the pace (the first time compiles the controller)'):
+        share, reason = too_slow(nodes, robot)
+    if not reason:
+        _print(console, f'real time: the flight needs {100 * share:.0f} % of a core')
+    elif actuators == 'emulated':
+        _print(console, f'{reason}; emulated devices have real time only', style='yellow')
+    else:
+        _print(console, f'{reason}; simulated time is used', style='yellow')
+        return 'simulated'
+    return 'system'
+
+
 def _conclude(bag: Path, task: Task, meta: dict, failure: str, slow: str,
-              json_path: Path | None, console: Console, full: bool) -> int:
+              json_path: Path | None, console: Console, full: bool, film: bool) -> int:
     """Report the flight of a bag and why it failed; return the exit status."""
     if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
-        if (bag / 'metadata.yaml').exists():
-            add_meta(bag, meta)
-        log = read_bag(bag)
-        for line in log.warnings:
-            _print(console, line, style='yellow')
-        result = metrics(log, task)
-        results = {'meta': meta, meta['controller']: result}
-        if log.targets:     # a controller flew
-            table.print_results(results, console, full=full)
-        write_json(json_path, results)
+        result = _report(bag, meta['controller'], task, meta, json_path, console, full, film)
         failure = failure or failed(result)
     if 'interrupted' in meta:
         if bag.exists():
@@ -293,3 +306,19 @@ class Flight(Operator):
         status = self.diagnostics.get('recorder_node: bag')
         if status is not None and status.level >= ERROR:
             raise RunError(status.message)
+
+
+def _report(bag, controller, task, meta, json_path, console, full, film) -> dict:
+    if (bag / 'metadata.yaml').exists():
+        add_meta(bag, meta)
+    log = read_bag(bag)
+    for line in log.warnings:
+        _print(console, line, style='yellow')
+    results = {'meta': meta, controller: metrics(log, task)}
+    if log.targets:     # a controller flew
+        table.print_results(results, console, full=full)
+    write_json(json_path, results)
+    if film and len(motion(log)):
+        from beetle_omni_ros.show.recorded import recorded_scene  # viser takes a second
+        write_text(bag / FILM, recorded_scene({controller: log}), 'film')
+    return results[controller]

@@ -21,7 +21,7 @@ from beetle_omni_ros.bags.log import (
 from beetle_omni_ros.bags.metrics import L_WINDOW, U_WINDOW
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.model.schema import ParameterError, shortened
-from beetle_omni_ros.show.figures import COLOURS, FAINT, INK, PARTS
+from beetle_omni_ros.show.figures import BLUE, COLOURS, FAINT, GREY, INK, PARTS, RED, VIOLET
 from beetle_omni_ros.show.page import rendered
 
 MAX_RUNS = len(COLOURS)     # each run has its own colour
@@ -33,6 +33,9 @@ FEW_POSES = 20          # up to this number, L and U windows are shaded
 MOST_MARKS = 12         # of faults in a chart, and states in a strip
 TINY = {'m': 1e-4, 'deg': 1e-2}     # floor of logarithmic errors
 L_COLOUR, U_COLOUR, GRID = '#eef1f5', '#cfe3d4', '#e6e9ed'
+# Colour -> the one on a dark page.
+NIGHT = {INK: '#dde2e8', L_COLOUR: '#252c35', U_COLOUR: '#254232', GRID: '#343b44',
+         BLUE: '#5d9fe8', RED: '#f0665c', VIOLET: '#ab86d3', GREY: '#98a3af'}
 AXES = ('x [m]', 'y [m]', 'z [m]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]')
 STATE_COLOURS = {'flying': '#9cc7a8', 'takeoff': '#b9cfe6', 'landing': '#f0d29a',
                  'fallback': '#efb08a', 'emergency_stop': '#d9534f'}
@@ -81,7 +84,7 @@ def figure(runs: list[Run], *names: str) -> go.Figure:
             _mark(figure, runs, row)
         figure.update_yaxes(type='log' if of_target or label.startswith('CPU') else '-',
                             row=row, col=1, zeroline=False, exponentformat='power')
-    figure.update_xaxes(gridcolor=GRID)
+    figure.update_xaxes(gridcolor=GRID, zeroline=False)
     figure.update_yaxes(gridcolor=GRID)
     figure.update_xaxes(title='time since the first target [s]', row=len(charts), col=1)
     figure.update_annotations(font={'size': 12, 'color': INK})
@@ -100,7 +103,7 @@ def html(runs: list[Run]) -> str:
         if isinstance(trace['x'], dict) and trace['x']['dtype'] == 'f4':
             trace['x'] = times.setdefault(trace['x']['bdata'], len(times))
     return rendered('charts.html', plotly=get_plotlyjs(), figure={**found, 'times': list(times)},
-                    bins=BINS)
+                    bins=BINS, night=NIGHT)
 
 
 def _mark(figure, runs, row):

@@ -11,7 +11,9 @@ from beetle_omni_ros.bags.bag import read_flights
 from beetle_omni_ros.bags.log import FlightLog, motion
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.show.figures import COLOURS, colours_of
+from beetle_omni_ros.show.page import rendered
 from beetle_omni_ros.show.scene import close, drawable, moments, Room, serve
+from beetle_omni_ros.show.table import title
 
 RATE, MOST = 20.0, 4000     # [Hz] of the pictures; of all robots
 TEXT_EVERY = 4              # pictures
@@ -36,21 +38,22 @@ def recorded_scene(logs: Mapping[str, FlightLog]) -> str:
         paths = [drawable(motion(log).position) for log in logs.values()]
         for number, path in enumerate(paths):
             room.draw_path(number, path[::max(1, len(path) // PATH_POINTS)])
-        every = np.concatenate(paths)
-        room.look_at(every.min(axis=0), every.max(axis=0))
         recording = server.get_scene_serializer()
-        texts = [''] * len(logs)
+        text = ''
         columns = [moments(log, log.begin + times) for log in logs.values()]
         with server.atomic():       # nothing is sent in between
             for k, row in enumerate(zip(*columns, strict=True)):
                 if k % TEXT_EVERY == 0:
-                    texts = [f'{name}: {times[k]:.1f} s, {moment.text()}' if moment else ''
-                             for name, moment in zip(logs, row)]
-                room.show(row, texts)
+                    text = '\n'.join([f'{times[k]:.1f} s', *(
+                        f'{name}: {moment.text()}' for name, moment in zip(logs, row) if moment)])
+                room.show(row, text)
                 recording.insert_sleep(float(step))
-        return recording.as_html()
+        page = recording.as_html()
     finally:
         close(server)
+    head = rendered('viewer.html', title=title(next(iter(logs.values())).meta),
+                    runs=zip(logs, colours_of(logs.values())))
+    return page.replace('</head>', head + '</head>', 1)
 
 
 def run_view(runs: list[Path], *, host: str, port: int) -> None:

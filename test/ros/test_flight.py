@@ -178,7 +178,8 @@ def test_a_fall_in_the_landing_is_the_last_line_with_its_likely_cause(tmp_path, 
         return '', '; this computer was too slow'
 
     monkeypatch.setattr(fly_module, '_fly', flown)
-    assert fly_module.run_fly(task='random1', bag=bag, standby=False) == (speed > 1)
+    assert fly_module.run_fly(task='random1', bag=bag, clock='system', standby=False) \
+        == (speed > 1)
     out, err = capfd.readouterr()
     if speed > 1:
         assert err == ('beetle_omni fly: error: the robot fell in the landing; this computer was '
