@@ -66,7 +66,8 @@ class ModelMatching:
         inertia = after.inertia / before.inertia
         self._stiffness = inertia * before.kp / after.kp
         self._damping = (inertia * before.kd - after.kd) / after.kp
-        self._lag = robot.rotors.time_constant / trained.rotors.time_constant
+        # Faster rotors stay as they are: to slow them down would take accuracy away.
+        self._lag = max(robot.rotors.time_constant / trained.rotors.time_constant, 1.0)
         # A tilt turns the thrust of hover: both sizes are in newtons.
         self._weights = np.repeat([TILT_SHARE / robot.hover_thrust ** 2, 1.0], 4)
         self._latest: deque[tuple[Command, Command]] = deque(maxlen=latest)
