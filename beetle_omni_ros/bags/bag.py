@@ -4,13 +4,18 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from io import BytesIO
 from itertools import islice
 import json
 from pathlib import Path
+from struct import Struct
 from typing import NamedTuple
 
-from mcap.exceptions import InvalidMagic
-from mcap.reader import NonSeekingReader
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, InvalidMagic
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Schema
+from mcap.stream_reader import get_chunk_data_stream, read_magic
 import numpy as np
 
 from beetle_omni_ros.bags.conversions import from_nanoseconds
@@ -22,6 +27,7 @@ from beetle_omni_ros.model.schema import ParameterError, read_yaml
 
 BagError = ParameterError   # its name in identify
 AT_ONCE = 4096      # messages that are read together
+HEAD, FIELDS = Struct('<BQ'), Struct('<HIQQ')   # of each record of a file, and of a message
 
 
 class Recorded(NamedTuple):
@@ -120,13 +126,11 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         except OSError as error:
             raise ParameterError(f'{file}: {error.strerror}') from None
         with stream:
-            messages = NonSeekingReader(stream, validate_crcs=True).iter_messages(
-                log_time_order=False)
             try:
-                for schema, channel, message in messages:
+                read_magic(ReadDataStream(stream))
+                for topic, kind, data, received in _messages(stream, {}, {0: ''}):
                     count += 1
-                    yield Recorded(channel.topic, schema.name if schema else '', message.data,
-                                   from_nanoseconds(message.log_time))
+                    yield Recorded(topic, kind, data, from_nanoseconds(received))
             except Exception as error:  # broken bytes raise anything in the library
                 if isinstance(error, InvalidMagic) and not count:
                     raise ParameterError(f'{file}: not an MCAP file') from None
@@ -138,6 +142,31 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         readable += count
     if broken and not readable:
         raise ParameterError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
+
+
+def _messages(stream, topics, schemas, outside=True):
+    """Yield topic, type, data, time [ns] of messages; the library takes four times as long."""
+    while len(head := stream.read(HEAD.size)) == HEAD.size:
+        kind, length = HEAD.unpack(head)
+        if len(data := stream.read(length)) < length:
+            break
+        record = ReadDataStream(BytesIO(data)) if kind != Opcode.MESSAGE else None
+        if kind == Opcode.MESSAGE:
+            channel, _, received, _ = FIELDS.unpack_from(data)
+            yield *topics[channel], data[FIELDS.size:], received
+        elif kind == Opcode.CHUNK:
+            part, size = get_chunk_data_stream(Chunk.read(record), validate_crc=True)
+            yield from _messages(BytesIO(part.read(size)), topics, schemas, False)
+        elif kind == Opcode.CHANNEL:
+            channel = Channel.read(record)
+            topics[channel.id] = channel.topic, schemas[channel.schema_id]
+        elif kind == Opcode.SCHEMA:
+            schema = Schema.read(record)
+            schemas[schema.id] = schema.name
+        elif kind == Opcode.FOOTER:
+            return
+    if head or outside:
+        raise EndOfFile
 
 
 def read_together(path: str | Path, warnings: list[str] | None = None

@@ -211,7 +211,7 @@ class Engine:
             linear = self._linear(flight, at)
             # linear about the robot file
             residual = linear.residual - linear.slopes @ at
-            slopes = np.zeros((*residual.shape, len(self.names)))
+            slopes = np.zeros((len(self.names), *residual.T.shape)).T     # times are contiguous
             slopes[:, :, :self.real] = linear.slopes
             for at_flight, key, column in self.repeats:
                 if fitted and at_flight == k:
