@@ -225,6 +225,15 @@ class Engine:
             spectra.append(found)
         return spectra
 
+    def others(self, flights: Sequence, theta: np.ndarray) -> tuple[list, bool]:
+        """Spectra of flights at ``theta`` (K,), common filter; whether they are the fitted."""
+        keep, fitted = (self.flights, self.generic, self.filters), list(flights) == self.flights
+        self.flights, self.filters = list(flights), [self.common] * len(flights)
+        self.generic = discrepancies(self.flights)
+        spectra = self._spectra(theta, np.zeros((len(flights), len(self.names))), fitted)
+        self.flights, self.generic, self.filters = keep
+        return spectra, fitted
+
     def _linear(self, flight, at):
         """Linear model of a flight at real keys; the last one is kept."""
         point, linear = self._last.get(flight, (None, None))

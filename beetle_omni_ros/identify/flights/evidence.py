@@ -191,9 +191,8 @@ class Judge:
         self.covariance = np.linalg.inv(equations.info + np.diag(narrow**-2))
         self.mean = self.covariance @ equations.right
         self.blocks = len(equations.scores)
-        # The scatter between few blocks is uncertain: variance by Student's t at this level.
         self.owner, self.far = owner, far
-        self.student = float((t.isf(level / 2, max(self.blocks - 1, 1)) / norm.isf(level / 2))**2)
+        self.student = student(level, self.blocks)
         self._kept: dict[tuple[int, ...], Posterior] = {}
         self._profiles: dict[tuple[int, ...], tuple] = {}
 
@@ -325,6 +324,11 @@ class Judge:
             mean = mean + change * (shift * deviation)
             total = total - change[:, None] * (total[k] * (1 - left))
         return value, mean, total
+
+
+def student(level: float, blocks: int) -> float:
+    """Factor of a variance because the scatter between few blocks is uncertain: Student's t."""
+    return float((t.isf(level / 2, max(blocks - 1, 1)) / norm.isf(level / 2))**2)
 
 
 @lru_cache(100_000)      # the same priors end at the same bounds in most sets

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros.bags.bag import BagError, read_columns, read_together
-from beetle_omni_ros.bags.log import CHANNELS
+from beetle_omni_ros.bags.log import CHANNELS, FlightLog, SERIES
 from beetle_omni_ros.bags.messages import from_bytes
 from beetle_omni_ros.bags.topics import ALL
 from beetle_omni_ros.model.parameters import JOINT_NAMES, ROTOR_NAMES
@@ -93,6 +93,17 @@ def read_recording(path: str | Path) -> Recording:
     _check_members(path, data, times)
     warnings += [f'{name}: {count} messages not readable' for name, count in bad.items()]
     return Recording(Path(path).name, times, values, states, warnings, received)
+
+
+def recording_of(log: FlightLog, name: str) -> Recording:
+    """A flight in memory as it is read from a bag."""
+    series = {topic: getattr(log, own) for own, (topic, _) in SERIES.items() if topic in PARTS}
+    return Recording(
+        name, {topic: own.t for topic, own in series.items()},
+        {topic: np.column_stack([getattr(series[topic], channel) for channel in channels])
+         for topic, channels in PARTS.items()},
+        [(float(t), str(mode)) for t, mode in zip(log.state_t, log.states, strict=True)],
+        received={topic: own.received for topic, own in series.items()})
 
 
 def _note(states, messages):

@@ -1,0 +1,317 @@
+"""
+The next flight: manoeuvres whose measurements answer what the flights left open.
+
+The hypotheses are sets of catalogue entries. Under hypothesis i, the keys theta have the posterior
+N(m_i, P_i) of the flights so far. Manoeuvres with the information M of all keys measure
+z = L' theta + e, where M = L L' and e is white, so that z is N(L' m_i, L' P_i L + 1). The expected
+evidence for i over j is the divergence of these two normal densities. Whatever another hypothesis,
+a tolerance, the flight or the discrepancy explains as well, it does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import log
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from beetle_omni_ros.bags.log import FlightLog
+from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
+from beetle_omni_ros.identify.flights.bag_flight import BagFlight
+from beetle_omni_ros.identify.flights.engine import Engine
+from beetle_omni_ros.identify.flights.evidence import normal, Solution, student
+from beetle_omni_ros.identify.flights.results import member_of, named_of, parameters, Starts
+from beetle_omni_ros.identify.flights.spectrum import blocks_of, pooled, WARM
+from beetle_omni_ros.identify.recording.bag import recording_of
+from beetle_omni_ros.identify.recording.flight import prepare, UnusableFlight
+from beetle_omni_ros.identify.recording.parameters import GapParameters
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
+
+OPEN = 'named_set', 'not_decidable'     # verdicts
+MOST = 5                # hypotheses that are compared
+SIMULATED = 3           # of these, the most probable ones are plants of the check of the task
+ENOUGH = 25.0           # [nat] of evidence; more is not better
+SAMPLES = 400           # of measurements of each hypothesis
+FAINT = 1e-4            # information in units of the priors that does not count
+TRIALS = 3              # tasks that are checked before there is none
+Grams = dict[str, np.ndarray]       # manoeuvre -> (K, K) information of its block
+
+
+class Experiments(Protocol):
+    """
+    What flies manoeuvres, see :mod:`beetle_omni_ros.flight.experiment`.
+
+    Attributes:
+        names: manoeuvres.
+        duration, lead: of a manoeuvre and of the hover before the first one [s].
+        most: manoeuvres of a task.
+
+    """
+
+    names: tuple[str, ...]
+    duration: float
+    lead: float
+    most: int
+
+    def flown(self, names: Sequence[str], plant: RobotParameters | None = None
+              ) -> FlightLog | None:
+        """Fly manoeuvres with a plant, by default the robot file; None: a crash."""
+
+    def why_unsafe(self, names: Sequence[str], log: FlightLog) -> dict[str, str]:
+        """Manoeuvres without margin to a limit, each with that limit."""
+
+    def write(self, path: Path, names: Sequence[str], head: str) -> None:
+        """Write a task with a comment."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """
+    A set of entries that may be the truth.
+
+    Attributes:
+        label: of the entry that distinguishes it, or 'none'.
+        chosen: indices of all its entries.
+        odds: ln of its probability, but for a constant.
+        mean, covariance: (K,) and (K, K) of all keys by the flights so far.
+
+    """
+
+    label: str
+    chosen: tuple[int, ...]
+    odds: float
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
+def hypotheses_of(engine: Engine, solution: Solution) -> list[Hypothesis]:
+    """The most probable one first: a set and its rivals, or single entries and none."""
+    judge, best = solution.judge, solution.best
+    unclear = [own for own in named_of(engine, solution, engine.alpha) if len(own[1]) > 1]
+    if unclear:
+        k, members = unclear[0]
+        rest = set(best) - {k}
+        given = {tuple(sorted(rest | {j})): j for j in members}
+    else:
+        varying = {k for k in best if solution.entries[k].varying}
+        given = {tuple(sorted({*varying, k})): k for k, entry in enumerate(solution.entries)
+                 if not entry.varying and k not in solution.banned and (k,) in solution.gains}
+        given[tuple(sorted(varying))] = -1
+    odds = {chosen: engine.gain(judge, chosen, best) for chosen in given}
+    first = sorted(odds, key=odds.get, reverse=True)[:MOST]         # type: ignore[arg-type]
+    equations = normal(solution.spectra, engine.names, engine.flight)
+    found = []
+    for chosen in first:
+        mean, covariance = _posterior(engine, solution, equations, chosen)
+        label = solution.entries[given[chosen]].label if given[chosen] >= 0 else 'none'
+        found.append(Hypothesis(label, chosen, odds[chosen], mean, covariance))
+    return found
+
+
+def _posterior(engine, solution, equations, chosen):
+    """Mean and covariance of all keys, with the priors that the engine has for a set."""
+    prior = engine.narrow.copy()
+    free = engine.indices((*chosen, *solution.banned))
+    prior[free] = np.hypot(prior[free], engine.typical[free])
+    c, _, _, _, slab = solution.judge._profile(tuple(sorted(engine.indices(chosen))))
+    prior[c] = np.where(np.isin(c, free), slab, prior[c])
+    covariance = prior[:, None] * np.linalg.inv(
+        prior[:, None] * equations.info * prior + np.eye(len(prior))) * prior
+    return covariance @ equations.right, covariance
+
+
+class Outlook:
+    """What manoeuvres are expected to decide between hypotheses."""
+
+    def __init__(self, engine: Engine, solution: Solution, hypotheses: Sequence[Hypothesis]):
+        self._engine, self.hypotheses = engine, list(hypotheses)
+        self._blocks = sum(len(each.residual) for each in solution.spectra)
+        self._scale = np.hypot(engine.narrow, engine.typical)
+        odds = np.array([each.odds for each in hypotheses])
+        self.odds, self.weights = odds, np.exp(odds - np.logaddexp.reduce(odds))
+
+    def information(self, grams: Sequence[np.ndarray]) -> np.ndarray:
+        """(K, K) information of blocks of one flight without what differs between flights."""
+        engine, total = self._engine, np.sum(grams, axis=0)
+        own = np.flatnonzero(engine.flight > 0)
+        inner = np.linalg.inv(total[np.ix_(own, own)] + np.diag(engine.flight[own]**-2))
+        total = total - total[:, own] @ inner @ total[own]
+        return total / student(engine.alpha / len(engine.entries), self._blocks + len(grams))
+
+    def measured(self, information: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Mean (r,) and covariance (r, r) of the measurements under each hypothesis."""
+        s = self._scale
+        values, vectors = np.linalg.eigh(s[:, None] * information * s)
+        keep = values > FAINT
+        root = np.sqrt(values[keep]) * vectors[:, keep] / s[:, None]
+        return [(root.T @ each.mean, root.T @ each.covariance @ root + np.eye(keep.sum()))
+                for each in self.hypotheses]
+
+    def evidence(self, information: np.ndarray) -> np.ndarray:
+        """(H, H) expected ln of the probability of each hypothesis, if true, over another one."""
+        moments = self.measured(information)
+        return np.array([[a - b + divergence(*own, *other) for other, b in zip(
+            moments, self.odds, strict=True)] for own, a in zip(moments, self.odds, strict=True)])
+
+    def value(self, information: np.ndarray) -> float:
+        """Mean of the evidence for the truth over its strongest rival [nat]."""
+        gains = np.minimum(self.evidence(information), ENOUGH)
+        np.fill_diagonal(gains, np.inf)
+        return float(self.weights @ gains.min(axis=1))
+
+    def chances(self, information: np.ndarray, seed: int = 0) -> np.ndarray:
+        """(H, 2) probability that each hypothesis, if true, is decided, and another one is."""
+        moments, rng = self.measured(information), np.random.default_rng(seed)
+        least, found = log(1 / self._engine.alpha), []
+        for k, (mean, covariance) in enumerate(moments):
+            z = mean + rng.normal(size=(SAMPLES, len(mean))) @ np.linalg.cholesky(covariance).T
+            odds = self.odds + np.stack([density(z, *own) for own in moments], axis=1)
+            order = np.sort(odds, axis=1)
+            sure = order[:, -1] - order[:, -2] > least
+            right = odds.argmax(axis=1) == k
+            found.append([(sure & right).mean(), (sure & ~right).mean()])
+        return np.array(found)
+
+
+def divergence(mean: np.ndarray, covariance: np.ndarray, other: np.ndarray, wide: np.ndarray
+               ) -> float:
+    """Divergence [nat] of N(mean, covariance) from N(other, wide)."""
+    inverse, away = np.linalg.inv(wide), mean - other
+    return float(0.5 * (np.sum(inverse * covariance) - len(mean) + away @ inverse @ away
+                        + np.linalg.slogdet(wide)[1] - np.linalg.slogdet(covariance)[1]))
+
+
+def density(z: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """(N,) ln of the normal density of z (N, r), but for a constant."""
+    left = np.linalg.solve(np.linalg.cholesky(covariance), (z - mean).T)
+    return -0.5 * (left**2).sum(axis=0) - 0.5 * np.linalg.slogdet(covariance)[1]
+
+
+def chosen(outlook: Outlook, grams: Grams, lead: np.ndarray, most: int) -> list[str]:
+    """Manoeuvres, one after the other the one with which the value is largest."""
+    names: list[str] = []
+    parts = [lead]
+    for _ in range(most):
+        values = {name: outlook.value(outlook.information([*parts, gram]))
+                  for name, gram in grams.items()}
+        names.append(max(values, key=values.get))       # type: ignore[arg-type]
+        parts.append(grams[names[-1]])
+    return names
+
+
+def grams_of(engine: Engine, solution: Solution, log_: FlightLog, names: Sequence[str],
+             experiments: Experiments, robot: RobotParameters, p: GapParameters
+             ) -> list[tuple[str, np.ndarray]]:
+    """Information (K, K) of the block of each manoeuvre of a flight that can be used."""
+    like = engine.flights[0]
+    try:
+        recording = prepare(recording_of(log_, 'next flight'), robot, p)
+    except UnusableFlight:
+        return []
+    flight = BagFlight(recording, robot, like._body, like.keys, p)
+    flight.modules, flight.starts, flight.tangents = like.modules, like.starts, like.tangents
+    theta = np.zeros(len(engine.names))
+    theta[:engine.known] = solution.theta[:engine.known]
+    begin = log_.begin + experiments.lead - recording.start
+    end = begin + len(names) * experiments.duration
+    flight.mask &= ((flight.time >= begin - WARM) & (flight.time < end))[:, None]
+    rows = blocks_of(flight.mask & (flight.time >= begin)[:, None], flight.period)
+    places = np.rint((flight.time[rows[:, 0]] - begin) / experiments.duration).astype(int)
+    flight.settle(dict(zip(engine.names, theta[:engine.real], strict=False)))
+    [found], _ = engine.others([flight], theta)
+    found.noise = pooled(solution.spectra)
+    grams = found.grams()[0].sum(axis=1)
+    return [(names[k], gram) for k, gram in zip(places, grams, strict=False)]
+
+
+def next_flight(engine: Engine, solution: Solution, result: dict, starts: Starts, *,
+                robot: RobotParameters, p: GapParameters, experiments: Experiments,
+                path: Path) -> dict[str, Any]:
+    """
+    Plan a flight, check it in the simulator, and write it as a task.
+
+    Args:
+        engine: with the flights so far.
+        solution: of the engine.
+        result: of the analysis.
+        starts: as of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`.
+        robot: robot file.
+        p: parameters of the gap finder.
+        experiments: simulated manoeuvres.
+        path: task to write.
+
+    Returns:
+        ``next_flight``: ``task`` (None: none is written), ``sentence``, and of a written one
+        ``manoeuvres``, ``probability`` that it decides rightly and ``wrong`` that it decides
+        wrongly, and both of each of the ``hypotheses``.
+
+    """
+    def without(sentence):
+        return {'next_flight': {'task': None, 'sentence': sentence}}
+
+    if result['verdict'] not in OPEN:
+        return without(f"{result['verdict']}: there is nothing to decide, and no task is written")
+    outlook = Outlook(engine, solution, hypotheses_of(engine, solution))
+    log_ = experiments.flown(experiments.names)
+    if log_ is None:
+        return without('the manoeuvres crash in the simulator: no task is written')
+    unsafe = experiments.why_unsafe(experiments.names, log_)
+    grams = {name: gram for name, gram in grams_of(
+        engine, solution, log_, experiments.names, experiments, robot, p) if name not in unsafe}
+    plants = [plant_of(engine, solution, each, robot, starts)
+              for each in outlook.hypotheses[:SIMULATED]]
+    for _ in range(TRIALS):
+        if len(grams) < 2:
+            break
+        names = chosen(outlook, grams, grams.get('hover', 0 * next(iter(grams.values()))),
+                       experiments.most)
+        beyond: dict[str, str] = {}
+        flights = []
+        for plant in plants:
+            if log_ := experiments.flown(names, plant):
+                flights.append(log_)
+                beyond |= experiments.why_unsafe(names, log_)
+            else:
+                beyond |= dict.fromkeys(names, 'crash')
+        if not beyond:
+            return {'next_flight': _written(
+                outlook, grams_of(engine, solution, flights[0], names, experiments, robot, p),
+                names, path, experiments)}
+        grams = {name: gram for name, gram in grams.items() if name not in beyond}
+    return without('no manoeuvre keeps its margins with all candidates: no task is written')
+
+
+def _written(outlook, grams, names, path, experiments):
+    """Write a task; what it is expected to decide."""
+    chances = outlook.chances(outlook.information([gram for _, gram in grams]))
+    right, wrong = outlook.weights @ chances
+    labels = [each.label.replace('_', ' ') for each in outlook.hypotheses]
+    duration = experiments.lead + len(names) * experiments.duration
+    sentence = (f"{path}: {duration:.0f} s, decides between {' and '.join(labels)} with a "
+                f'probability of {right:.2f}, and wrongly with {wrong:.2f}')
+    steps = '; '.join(names)
+    experiments.write(path, names, f'Written by beetle_omni gap --next.\n{sentence}.\n'
+                                   f'After {experiments.lead:g} s of hover: {steps}.')
+    return {'task': str(path), 'sentence': sentence, 'manoeuvres': list(names),
+            'probability': float(right), 'wrong': float(wrong), 'hypotheses': [
+                {'name': each.label, 'weight': float(weight), 'probability': float(own[0]),
+                 'wrong': float(own[1])} for each, weight, own in zip(
+                    outlook.hypotheses, outlook.weights, chances, strict=True)]}
+
+
+def plant_of(engine: Engine, solution: Solution, hypothesis: Hypothesis, robot: RobotParameters,
+             starts: Starts) -> RobotParameters:
+    """The robot file with the fitted values of a hypothesis, as far as they are possible."""
+    index = sorted(engine.indices(hypothesis.chosen))
+    posterior = solution.judge.posterior(index)
+    named = [{'names': [entry.name], **member_of(entry), 'parameters': parameters(
+        entry, engine, index, posterior, engine.flights[0].keys, starts)}
+        for entry in (solution.entries[k] for k in hypothesis.chosen) if not entry.varying]
+    try:
+        return robot_with(robot, effects_with(robot, named))
+    except ParameterError:
+        return robot
