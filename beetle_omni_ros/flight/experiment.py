@@ -47,9 +47,9 @@ def _swung(axis: int, size: float, frequency: float, last: float | None = None
 
 
 def _window(t):
-    """(N,) from 0 to 1 and back to 0, with continuous accelerations."""
+    """(N,) from 0 to 1 and back to 0, with continuous jerk."""
     s = np.clip(np.minimum(t, DURATION - t) / RAMP, 0, 1)
-    return s**3 * (10 - 15 * s + 6 * s * s)
+    return s**4 * (35 - 84 * s + 70 * s**2 - 20 * s**3)
 
 
 def _on(axis, values):
@@ -61,19 +61,15 @@ def _on(axis, values):
 # Name -> offset (N, 6) from START over time (N,): x, y, z [m], roll, pitch, yaw [rad].
 X, Y, Z, ROLL, PITCH, YAW = range(6)
 MANOEUVRES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    'hover': _held(Z, 0.0),
     'hover at 0.5 m': _held(Z, -0.7),
     'passes along x': _swung(X, 1.2, 0.3),
     'passes along y': _swung(Y, 1.2, 0.3),
     'climbs': _swung(Z, 0.5, 0.4),
     'chirp along x': _swung(X, 0.05, 0.3, 2.0),
     'chirp along z': _swung(Z, 0.04, 0.3, 2.0),
-    'roll 45 deg': _held(ROLL, np.pi / 4),
     'roll 90 deg': _held(ROLL, np.pi / 2),
     'roll 180 deg': _held(ROLL, np.pi),
-    'pitch 45 deg': _held(PITCH, np.pi / 4),
     'pitch 80 deg': _held(PITCH, np.radians(80)),
-    'yaw 90 deg': _held(YAW, np.pi / 2),
     'yaw 180 deg': _held(YAW, np.pi),
     'roll swings': _swung(ROLL, 0.7, 0.5),
     'pitch swings': _swung(PITCH, 0.7, 0.5),
@@ -82,7 +78,7 @@ MANOEUVRES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     'pitch chirp': _swung(PITCH, 0.2, 0.4, 2.0),
     'yaw chirp': _swung(YAW, 0.25, 0.4, 2.0),
 }
-LEVEL = tuple(name for name in MANOEUVRES if 'roll' not in name and 'pitch' not in name)
+LEVEL = tuple(name for name in MANOEUVRES if name.split()[0] not in ('roll', 'pitch', 'chirp'))
 
 
 class Experiments:
@@ -133,6 +129,15 @@ class Experiments:
             for k in np.unique(places[(places >= 0) & (places < len(names))]):
                 found.setdefault(names[k], what)
         return found
+
+    @staticmethod
+    def level_motion(names: Sequence[str], period: float) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (N, 3) [m] and yaw (N,) [rad], from a start on the ground."""
+        _, poses = set_points(names, period)
+        rise = np.zeros((round(POSE_DURATION / period), 6))
+        rise[:, 2] = START[2] * _window(period * np.arange(len(rise)) * 0.5)
+        poses = np.concatenate([rise, poses])
+        return poses[:, :3], poses[:, 5]
 
     @staticmethod
     def write(path: Path, names: Sequence[str], head: str) -> None:

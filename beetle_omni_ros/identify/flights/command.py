@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -12,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from beetle_omni_ros.bags.bag import names_of, runs_in
 from beetle_omni_ros.identify.flights.apply import write_corrected
-from beetle_omni_ros.identify.flights.next_flight import Experiments, next_flight
+from beetle_omni_ros.identify.flights.next_flight import Experiments, Planner
 from beetle_omni_ros.identify.flights.page import gap_page, grids, headline
 from beetle_omni_ros.identify.flights.results import ALPHA, result_of
 from beetle_omni_ros.identify.flights.verdict import judged, judged_tables, load_tables
@@ -88,11 +87,12 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
             result, made_page = analyse_joint_logs(runs, holdout, model, robot)
         html = made_page() if page else ''
     else:
-        then = partial(next_flight, robot=model, p=p, experiments=experiments(model),
-                       path=next_task) if next_task and experiments else None
+        then = Planner(model, p, experiments(model), next_task) \
+            if next_task and experiments else None
         # On small matrices, several threads only take more CPU time.
         with console.status('reading') as status, threadpool_limits(1):
-            result = _tables(runs, holdout, model, p, form, alpha, status.update) if form \
+            result = _tables(runs, holdout, model, p, form, alpha, status.update,
+                             then) if form \
                 else _bags(runs, holdout, model, p, fix, alpha, status.update, then)
         result['meta'] |= {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                            'robot': str(robot) if robot else 'params/robot.yaml', 'alpha': alpha}
@@ -106,10 +106,10 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
     return result
 
 
-def _tables(runs, holdout, robot, p, form, alpha, progress):
+def _tables(runs, holdout, robot, p, form, alpha, progress, then):
     declared = Format.load(form)
     flights, judging = (load_tables(paths, robot, declared) for paths in (runs, holdout))
-    result = judged_tables(flights, judging, robot, p, declared, alpha, progress)
+    result = judged_tables(flights, judging, robot, p, declared, alpha, progress, then)
     result['meta']['format'] = declared.name
     return result
 

@@ -21,10 +21,10 @@ from math import comb, exp, inf, log, log1p, pi, sqrt
 
 import numpy as np
 from scipy.special import log_ndtr
-from scipy.stats import norm, t
 
 from beetle_omni_ros.identify.flights.keys import Entry
 from beetle_omni_ros.identify.flights.spectrum import Spectrum
+from beetle_omni_ros.identify.inference.noise import few_blocks
 
 NONE = np.zeros(0, dtype=int)
 
@@ -192,7 +192,7 @@ class Judge:
         self.mean = self.covariance @ equations.right
         self.blocks = len(equations.scores)
         self.owner, self.far = owner, far
-        self.student = student(level, self.blocks)
+        self.student = few_blocks(level, self.blocks)
         self._kept: dict[tuple[int, ...], Posterior] = {}
         self._profiles: dict[tuple[int, ...], tuple] = {}
 
@@ -324,11 +324,6 @@ class Judge:
             mean = mean + change * (shift * deviation)
             total = total - change[:, None] * (total[k] * (1 - left))
         return value, mean, total
-
-
-def student(level: float, blocks: int) -> float:
-    """Factor of a variance because the scatter between few blocks is uncertain: Student's t."""
-    return float((t.isf(level / 2, max(blocks - 1, 1)) / norm.isf(level / 2))**2)
 
 
 @lru_cache(100_000)      # the same priors end at the same bounds in most sets

@@ -22,9 +22,11 @@ from beetle_omni_ros.bags.log import FlightLog
 from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.evidence import normal, Solution, student
+from beetle_omni_ros.identify.flights.evidence import normal, Solution
+from beetle_omni_ros.identify.flights.flat import flat_flight
 from beetle_omni_ros.identify.flights.results import member_of, named_of, parameters, Starts
 from beetle_omni_ros.identify.flights.spectrum import blocks_of, pooled, WARM
+from beetle_omni_ros.identify.inference.noise import few_blocks
 from beetle_omni_ros.identify.recording.bag import recording_of
 from beetle_omni_ros.identify.recording.flight import prepare, UnusableFlight
 from beetle_omni_ros.identify.recording.parameters import GapParameters
@@ -33,10 +35,11 @@ from beetle_omni_ros.model.schema import ParameterError
 
 OPEN = 'named_set', 'not_decidable'     # verdicts
 MOST = 5                # hypotheses that are compared
-SIMULATED = 3           # of these, the most probable ones are plants of the check of the task
+SIMULATED = 2           # of these, the most probable ones are plants of the check of the task
 ENOUGH = 25.0           # [nat] of evidence; more is not better
 SAMPLES = 400           # of measurements of each hypothesis
 FAINT = 1e-4            # information in units of the priors that does not count
+MOST_THRUST = 0.9       # of the largest thrust, without a simulator
 TRIALS = 3              # tasks that are checked before there is none
 Grams = dict[str, np.ndarray]       # manoeuvre -> (K, K) information of its block
 
@@ -46,13 +49,14 @@ class Experiments(Protocol):
     What flies manoeuvres, see :mod:`beetle_omni_ros.flight.experiment`.
 
     Attributes:
-        names: manoeuvres.
+        names, level: manoeuvres, and those of a robot whose rotors do not tilt.
         duration, lead: of a manoeuvre and of the hover before the first one [s].
         most: manoeuvres of a task.
 
     """
 
     names: tuple[str, ...]
+    level: tuple[str, ...]
     duration: float
     lead: float
     most: int
@@ -63,6 +67,10 @@ class Experiments(Protocol):
 
     def why_unsafe(self, names: Sequence[str], log: FlightLog) -> dict[str, str]:
         """Manoeuvres without margin to a limit, each with that limit."""
+
+    def level_motion(self, names: Sequence[str], period: float
+                     ) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (N, 3) [m] and yaw (N,) [rad], from a start on the ground."""
 
     def write(self, path: Path, names: Sequence[str], head: str) -> None:
         """Write a task with a comment."""
@@ -140,7 +148,7 @@ class Outlook:
         own = np.flatnonzero(engine.flight > 0)
         inner = np.linalg.inv(total[np.ix_(own, own)] + np.diag(engine.flight[own]**-2))
         total = total - total[:, own] @ inner @ total[own]
-        return total / student(engine.alpha / len(engine.entries), self._blocks + len(grams))
+        return total / few_blocks(engine.alpha / len(engine.entries), self._blocks + len(grams))
 
     def measured(self, information: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Mean (r,) and covariance (r, r) of the measurements under each hypothesis."""
@@ -154,8 +162,15 @@ class Outlook:
     def evidence(self, information: np.ndarray) -> np.ndarray:
         """(H, H) expected ln of the probability of each hypothesis, if true, over another one."""
         moments = self.measured(information)
-        return np.array([[a - b + divergence(*own, *other) for other, b in zip(
-            moments, self.odds, strict=True)] for own, a in zip(moments, self.odds, strict=True)])
+        inverses = [np.linalg.inv(covariance) for _, covariance in moments]
+        volumes = [np.linalg.slogdet(covariance)[1] for _, covariance in moments]
+        gains = self.odds[:, None] - self.odds
+        for i, (mean, covariance) in enumerate(moments):
+            for j, (other, _) in enumerate(moments):
+                away = mean - other
+                gains[i, j] += 0.5 * (np.sum(inverses[j] * covariance) - len(mean)
+                                      + away @ inverses[j] @ away + volumes[j] - volumes[i])
+        return gains
 
     def value(self, information: np.ndarray) -> float:
         """Mean of the evidence for the truth over its strongest rival [nat]."""
@@ -177,24 +192,16 @@ class Outlook:
         return np.array(found)
 
 
-def divergence(mean: np.ndarray, covariance: np.ndarray, other: np.ndarray, wide: np.ndarray
-               ) -> float:
-    """Divergence [nat] of N(mean, covariance) from N(other, wide)."""
-    inverse, away = np.linalg.inv(wide), mean - other
-    return float(0.5 * (np.sum(inverse * covariance) - len(mean) + away @ inverse @ away
-                        + np.linalg.slogdet(wide)[1] - np.linalg.slogdet(covariance)[1]))
-
-
 def density(z: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """(N,) ln of the normal density of z (N, r), but for a constant."""
     left = np.linalg.solve(np.linalg.cholesky(covariance), (z - mean).T)
     return -0.5 * (left**2).sum(axis=0) - 0.5 * np.linalg.slogdet(covariance)[1]
 
 
-def chosen(outlook: Outlook, grams: Grams, lead: np.ndarray, most: int) -> list[str]:
+def chosen(outlook: Outlook, grams: Grams, most: int) -> list[str]:
     """Manoeuvres, one after the other the one with which the value is largest."""
     names: list[str] = []
-    parts = [lead]
+    parts: list[np.ndarray] = []
     for _ in range(most):
         values = {name: outlook.value(outlook.information([*parts, gram]))
                   for name, gram in grams.items()}
@@ -203,113 +210,145 @@ def chosen(outlook: Outlook, grams: Grams, lead: np.ndarray, most: int) -> list[
     return names
 
 
-def grams_of(engine: Engine, solution: Solution, log_: FlightLog, names: Sequence[str],
-             experiments: Experiments, robot: RobotParameters, p: GapParameters
-             ) -> list[tuple[str, np.ndarray]]:
-    """Information (K, K) of the block of each manoeuvre of a flight that can be used."""
-    like = engine.flights[0]
-    try:
-        recording = prepare(recording_of(log_, 'next flight'), robot, p)
-    except UnusableFlight:
-        return []
-    flight = BagFlight(recording, robot, like._body, like.keys, p)
-    flight.modules, flight.starts, flight.tangents = like.modules, like.starts, like.tangents
-    theta = np.zeros(len(engine.names))
-    theta[:engine.known] = solution.theta[:engine.known]
-    begin = log_.begin + experiments.lead - recording.start
-    end = begin + len(names) * experiments.duration
-    flight.mask &= ((flight.time >= begin - WARM) & (flight.time < end))[:, None]
-    rows = blocks_of(flight.mask & (flight.time >= begin)[:, None], flight.period)
-    places = np.rint((flight.time[rows[:, 0]] - begin) / experiments.duration).astype(int)
-    flight.settle(dict(zip(engine.names, theta[:engine.real], strict=False)))
-    [found], _ = engine.others([flight], theta)
-    found.noise = pooled(solution.spectra)
-    grams = found.grams()[0].sum(axis=1)
-    return [(names[k], gram) for k, gram in zip(places, grams, strict=False)]
-
-
-def next_flight(engine: Engine, solution: Solution, result: dict, starts: Starts, *,
-                robot: RobotParameters, p: GapParameters, experiments: Experiments,
-                path: Path) -> dict[str, Any]:
+def grams_of(engine: Engine, solution: Solution, flight: Any, begin: float,
+             names: Sequence[str], duration: float) -> list[tuple[str, np.ndarray]]:
     """
-    Plan a flight, check it in the simulator, and write it as a task.
+    Information (K, K) of the block of each manoeuvre that can be used.
 
     Args:
         engine: with the flights so far.
         solution: of the engine.
-        result: of the analysis.
-        starts: as of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`.
+        flight: as the engine's flights.
+        begin: of the first manoeuvre, in the time of the flight [s].
+        names: manoeuvres.
+        duration: of a manoeuvre [s].
+
+    """
+    end = begin + len(names) * duration
+    flight.mask &= ((flight.time >= begin - WARM) & (flight.time < end))[:, None]
+    rows = blocks_of(flight.mask & (flight.time >= begin)[:, None], flight.period)
+    if not len(rows):
+        return []
+    theta = np.zeros(len(engine.names))
+    theta[:engine.known] = solution.theta[:engine.known]
+    flight.settle(dict(zip(engine.names, theta[:engine.real], strict=False)))
+    [found], _ = engine.others([flight], theta)
+    found.noise = pooled(solution.spectra)
+    places = np.rint((flight.time[rows[:, 0]] - begin) / duration).astype(int)
+    return [(names[k], gram) for k, gram in zip(
+        places, found.grams()[0].sum(axis=1), strict=False) if k < len(names)]
+
+
+@dataclass(frozen=True, eq=False)
+class Planner:
+    """
+    Plans the next flight after an analysis.
+
+    Args:
         robot: robot file.
         p: parameters of the gap finder.
         experiments: simulated manoeuvres.
         path: task to write.
 
-    Returns:
-        ``next_flight``: ``task`` (None: none is written), ``sentence``, and of a written one
-        ``manoeuvres``, ``probability`` that it decides rightly and ``wrong`` that it decides
-        wrongly, and both of each of the ``hypotheses``.
-
     """
-    def without(sentence):
-        return {'next_flight': {'task': None, 'sentence': sentence}}
 
-    if result['verdict'] not in OPEN:
-        return without(f"{result['verdict']}: there is nothing to decide, and no task is written")
-    outlook = Outlook(engine, solution, hypotheses_of(engine, solution))
-    log_ = experiments.flown(experiments.names)
-    if log_ is None:
-        return without('the manoeuvres crash in the simulator: no task is written')
-    unsafe = experiments.why_unsafe(experiments.names, log_)
-    grams = {name: gram for name, gram in grams_of(
-        engine, solution, log_, experiments.names, experiments, robot, p) if name not in unsafe}
-    plants = [plant_of(engine, solution, each, robot, starts)
-              for each in outlook.hypotheses[:SIMULATED]]
-    for _ in range(TRIALS):
-        if len(grams) < 2:
-            break
-        names = chosen(outlook, grams, grams.get('hover', 0 * next(iter(grams.values()))),
-                       experiments.most)
-        beyond: dict[str, str] = {}
-        flights = []
-        for plant in plants:
-            if log_ := experiments.flown(names, plant):
-                flights.append(log_)
-                beyond |= experiments.why_unsafe(names, log_)
-            else:
-                beyond |= dict.fromkeys(names, 'crash')
-        if not beyond:
-            return {'next_flight': _written(
-                outlook, grams_of(engine, solution, flights[0], names, experiments, robot, p),
-                names, path, experiments)}
-        grams = {name: gram for name, gram in grams.items() if name not in beyond}
-    return without('no manoeuvre keeps its margins with all candidates: no task is written')
+    robot: RobotParameters
+    p: GapParameters
+    experiments: Experiments
+    path: Path
+
+    def __call__(self, engine: Engine, solution: Solution, result: dict,
+                 starts: Starts | None = None) -> dict[str, Any]:
+        """
+        Plan a flight, check it, and write it as a task.
+
+        Args:
+            engine: with the flights so far.
+            solution: of the engine.
+            result: of the analysis.
+            starts: as of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`; None:
+                flights of tables, whose robot is not simulated.
+
+        Returns:
+            ``next_flight``: ``task`` (None: none is written), ``sentence``, and of a written one
+            ``manoeuvres``, ``probability`` that it decides rightly and ``wrong`` that it decides
+            wrongly, and both of each of the ``hypotheses``.
+
+        """
+        if result['verdict'] not in OPEN:
+            return _without(f"{result['verdict']}: there is nothing to decide")
+        outlook = Outlook(engine, solution, hypotheses_of(engine, solution))
+        own = self.experiments
+        names = own.names if starts is not None else own.level
+        plants = [plant_of(engine, solution, each, self.robot, starts)
+                  for each in outlook.hypotheses[:SIMULATED if starts is not None else 0]]
+        found, beyond = self._flown(engine, solution, names, None, starts is None)
+        grams = {name: gram for name, gram in found if name not in beyond}
+        for _ in range(TRIALS):
+            if not grams:
+                break
+            names = tuple(chosen(outlook, grams, own.most))
+            found, beyond = [(name, grams[name]) for name in names], {}
+            for plant in plants:
+                found, more = self._flown(engine, solution, names, plant)
+                beyond |= more
+            if found and not beyond:
+                return {'next_flight': self._written(outlook, [gram for _, gram in found], names)}
+            grams = {name: gram for name, gram in grams.items() if name not in beyond}
+        return _without('no manoeuvre keeps its margins with all candidates')
+
+    def _flown(self, engine, solution, names, plant, flat=False):
+        """Information of the manoeuvres of a flight, and those without margins."""
+        own, like = self.experiments, engine.flights[0]
+        if flat:
+            level = flat_flight(like, *own.level_motion(names, like.period))
+            places = ((level.time - own.lead) / own.duration).astype(int)
+            most = np.array([level._thrust({})[0][places == k].max() for k in range(len(names))])
+            return grams_of(engine, solution, level, own.lead, names, own.duration), {
+                name: 'thrust' for name, thrust in zip(names, most, strict=True)
+                if thrust > MOST_THRUST * self.robot.rotors.thrust_max}
+        log_ = own.flown(names, plant)
+        if log_ is None:
+            return [], dict.fromkeys(names, 'crash')
+        try:
+            recording = prepare(recording_of(log_, 'next flight'), self.robot, self.p)
+        except UnusableFlight as error:
+            return [], dict.fromkeys(names, str(error))
+        flight = BagFlight(recording, self.robot, like._body, like.keys, self.p)
+        flight.modules, flight.starts, flight.tangents = like.modules, like.starts, like.tangents
+        begin = log_.begin + own.lead - recording.start
+        return grams_of(engine, solution, flight, begin, names, own.duration), \
+            own.why_unsafe(names, log_)
+
+    def _written(self, outlook, grams, names):
+        """Write a task; what it is expected to decide."""
+        own, path = self.experiments, self.path
+        chances = outlook.chances(outlook.information(grams))
+        right, wrong = outlook.weights @ chances
+        labels = [each.label.replace('_', ' ') for each in outlook.hypotheses]
+        duration = own.lead + len(names) * own.duration
+        sentence = (f"{path}: {duration:.0f} s, decides between {' and '.join(labels)} with a "
+                    f'probability of {right:.2f}, and wrongly with {wrong:.2f}')
+        own.write(path, names, f'Written by beetle_omni gap --next.\n{sentence}.\n'
+                               f"After {own.lead:g} s of hover: {'; '.join(names)}.")
+        return {'task': str(path), 'sentence': sentence, 'manoeuvres': list(names),
+                'probability': float(right), 'wrong': float(wrong), 'hypotheses': [
+                    {'name': each.label, 'weight': float(weight), 'probability': float(chance[0]),
+                     'wrong': float(chance[1])} for each, weight, chance in zip(
+                        outlook.hypotheses, outlook.weights, chances, strict=True)]}
 
 
-def _written(outlook, grams, names, path, experiments):
-    """Write a task; what it is expected to decide."""
-    chances = outlook.chances(outlook.information([gram for _, gram in grams]))
-    right, wrong = outlook.weights @ chances
-    labels = [each.label.replace('_', ' ') for each in outlook.hypotheses]
-    duration = experiments.lead + len(names) * experiments.duration
-    sentence = (f"{path}: {duration:.0f} s, decides between {' and '.join(labels)} with a "
-                f'probability of {right:.2f}, and wrongly with {wrong:.2f}')
-    steps = '; '.join(names)
-    experiments.write(path, names, f'Written by beetle_omni gap --next.\n{sentence}.\n'
-                                   f'After {experiments.lead:g} s of hover: {steps}.')
-    return {'task': str(path), 'sentence': sentence, 'manoeuvres': list(names),
-            'probability': float(right), 'wrong': float(wrong), 'hypotheses': [
-                {'name': each.label, 'weight': float(weight), 'probability': float(own[0]),
-                 'wrong': float(own[1])} for each, weight, own in zip(
-                    outlook.hypotheses, outlook.weights, chances, strict=True)]}
+def _without(reason):
+    return {'next_flight': {'task': None, 'sentence': f'{reason}, and no task is written'}}
 
 
 def plant_of(engine: Engine, solution: Solution, hypothesis: Hypothesis, robot: RobotParameters,
-             starts: Starts) -> RobotParameters:
+             starts: Starts | None) -> RobotParameters:
     """The robot file with the fitted values of a hypothesis, as far as they are possible."""
     index = sorted(engine.indices(hypothesis.chosen))
     posterior = solution.judge.posterior(index)
     named = [{'names': [entry.name], **member_of(entry), 'parameters': parameters(
-        entry, engine, index, posterior, engine.flights[0].keys, starts)}
+        entry, engine, index, posterior, engine.flights[0].keys, starts or {})}
         for entry in (solution.entries[k] for k in hypothesis.chosen) if not entry.varying]
     try:
         return robot_with(robot, effects_with(robot, named))

@@ -56,7 +56,7 @@ WEIGHED = 'mass', 'inertia'
 LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
 # Entries of the comparison of IMU and MoCap.
 SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
-Then = Callable[[Engine, Solution, dict, Starts], dict]     # further results
+Then = Callable[[Engine, Solution, dict, Starts | None], dict]     # further results
 
 def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: RobotParameters,
            p: GapParameters, alpha: float = ALPHA, then: Then | None = None) -> dict:
@@ -198,10 +198,10 @@ def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
 
 def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight],
                   robot: RobotParameters, p: GapParameters, declared: Format,
-                  alpha: float = ALPHA, progress: Callable[[str], None] = lambda text: None
-                  ) -> dict:
+                  alpha: float = ALPHA, progress: Callable[[str], None] = lambda text: None,
+                  then: Then | None = None) -> dict:
     """
-    Results of flights of one format; ``judging`` is held out.
+    Results of flights of one format; ``judging`` is held out. ``then`` may add to them.
 
     Raises:
         ParameterError: a flight has other channels than the first one.
@@ -238,9 +238,10 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
     if slow:
         groups['torque'] = {'used': True, 'channels': ['torque_x', 'torque_y'],
                             'reason': 'no gyroscope: means of 2 s, by the attitude'}
-    return concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
-                     findings=findings, slow=Balance(slow, robot) if slow else None,
-                     measured='specific_force' in declared.signals)
+    result = concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
+                       findings=findings, slow=Balance(slow, robot) if slow else None,
+                       measured='specific_force' in declared.signals)
+    return result | then(engine, solution, result, None) if then else result
 
 
 def _groups(flight, declared):
