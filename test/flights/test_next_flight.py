@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 
 from beetle_omni_ros.flight.experiment import Experiments
 from beetle_omni_ros.identify.flights.flat import flat_flight
-from beetle_omni_ros.identify.flights.next_flight import chosen, Hypothesis, Outlook, Planner
+from beetle_omni_ros.identify.flights.next_flight import chosen, Explanation, Outlook, Planner
 from beetle_omni_ros.identify.flights.verdict import load_tables
 from beetle_omni_ros.identify.recording.table import Format
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -27,7 +27,7 @@ def outlook(odds=(0.0, 0.0)):
     means = np.array([[0.8, 0, 0, 0], [0, 0.8, 0, 0]])
     spread = np.diag([0.1, 0.1, 0.5, 0.1])**2
     return Outlook(engine, solution, [
-        Hypothesis(label, (k,), odds[k], means[k], spread + 0.2**2 * np.diag(np.eye(KEYS)[k]))
+        Explanation(label, (k,), odds[k], means[k], spread + 0.2**2 * np.diag(np.eye(KEYS)[k]))
         for k, label in enumerate('ab')])
 
 

@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from beetle_omni_ros.bags.bag import names_of, runs_in
 from beetle_omni_ros.identify.flights.apply import write_corrected
-from beetle_omni_ros.identify.flights.next_flight import Experiments, Planner
+from beetle_omni_ros.identify.flights.next_flight import Experimenter, Planner
 from beetle_omni_ros.identify.flights.page import gap_page, grids, headline
 from beetle_omni_ros.identify.flights.results import ALPHA, result_of
 from beetle_omni_ros.identify.flights.verdict import judged, judged_tables, load_tables
@@ -45,7 +45,7 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
                 page: Path | None = None, console: Console | None = None,
                 parameters: Path | None = None, fix: bool = False, tolerances: bool = False,
                 form: str | None = None, alpha: float = ALPHA, next_task: Path | None = None,
-                experiments: Callable[[RobotParameters], Experiments] | None = None) -> dict:
+                experiments: Callable[[RobotParameters], Experimenter] | None = None) -> dict:
     """
     Find differences between model and measurement; arguments of `beetle_omni gap`.
 
@@ -83,6 +83,8 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
     runs, holdout = (list(given) if form else runs_in(given) for given in (runs, holdout))
     check_apart([*runs, *holdout])
     if form is None and any(is_joint_log(run) for run in runs):
+        if next_task:
+            raise ParameterError(f'--next {next_task}: expected flights, not logs of joints')
         with console.status('comparing the servos'):
             result, made_page = analyse_joint_logs(runs, holdout, model, robot)
         html = made_page() if page else ''

@@ -44,7 +44,7 @@ TRIALS = 3              # tasks that are checked before there is none
 Grams = dict[str, np.ndarray]       # manoeuvre -> (K, K) information of its block
 
 
-class Experiments(Protocol):
+class Experimenter(Protocol):
     """
     What flies manoeuvres, see :mod:`beetle_omni_ros.flight.experiment`.
 
@@ -77,7 +77,7 @@ class Experiments(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class Explanation:
     """
     A set of entries that may be the truth.
 
@@ -96,7 +96,7 @@ class Hypothesis:
     covariance: np.ndarray
 
 
-def hypotheses_of(engine: Engine, solution: Solution) -> list[Hypothesis]:
+def hypotheses_of(engine: Engine, solution: Solution) -> list[Explanation]:
     """The most probable one first: a set and its rivals, or single entries and none."""
     judge, best = solution.judge, solution.best
     unclear = [own for own in named_of(engine, solution, engine.alpha) if len(own[1]) > 1]
@@ -116,7 +116,7 @@ def hypotheses_of(engine: Engine, solution: Solution) -> list[Hypothesis]:
     for chosen in first:
         mean, covariance = _posterior(engine, solution, equations, chosen)
         label = solution.entries[given[chosen]].label if given[chosen] >= 0 else 'none'
-        found.append(Hypothesis(label, chosen, odds[chosen], mean, covariance))
+        found.append(Explanation(label, chosen, odds[chosen], mean, covariance))
     return found
 
 
@@ -135,7 +135,7 @@ def _posterior(engine, solution, equations, chosen):
 class Outlook:
     """What manoeuvres are expected to decide between hypotheses."""
 
-    def __init__(self, engine: Engine, solution: Solution, hypotheses: Sequence[Hypothesis]):
+    def __init__(self, engine: Engine, solution: Solution, hypotheses: Sequence[Explanation]):
         self._engine, self.hypotheses = engine, list(hypotheses)
         self._blocks = sum(len(each.residual) for each in solution.spectra)
         self._scale = np.hypot(engine.narrow, engine.typical)
@@ -254,7 +254,7 @@ class Planner:
 
     robot: RobotParameters
     p: GapParameters
-    experiments: Experiments
+    experiments: Experimenter
     path: Path
 
     def __call__(self, engine: Engine, solution: Solution, result: dict,
@@ -342,7 +342,7 @@ def _without(reason):
     return {'next_flight': {'task': None, 'sentence': f'{reason}, and no task is written'}}
 
 
-def plant_of(engine: Engine, solution: Solution, hypothesis: Hypothesis, robot: RobotParameters,
+def plant_of(engine: Engine, solution: Solution, hypothesis: Explanation, robot: RobotParameters,
              starts: Starts | None) -> RobotParameters:
     """The robot file with the fitted values of a hypothesis, as far as they are possible."""
     index = sorted(engine.indices(hypothesis.chosen))
