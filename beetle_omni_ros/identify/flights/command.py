@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
 from beetle_omni_ros.bags.bag import names_of, runs_in
 from beetle_omni_ros.identify.flights.apply import write_corrected
-from beetle_omni_ros.identify.flights.next_flight import Experimenter, Planner
+from beetle_omni_ros.identify.flights.next_flight import Planner
 from beetle_omni_ros.identify.flights.page import gap_page, grids, headline
 from beetle_omni_ros.identify.flights.results import ALPHA, result_of
 from beetle_omni_ros.identify.flights.verdict import judged, judged_tables, load_tables
@@ -45,7 +46,7 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
                 page: Path | None = None, console: Console | None = None,
                 parameters: Path | None = None, fix: bool = False, tolerances: bool = False,
                 form: str | None = None, alpha: float = ALPHA, next_task: Path | None = None,
-                experiments: Callable[[RobotParameters], Experimenter] | None = None) -> dict:
+                experiments: Callable[[RobotParameters], Any] | None = None) -> dict:
     """
     Find differences between model and measurement; arguments of `beetle_omni gap`.
 

@@ -14,11 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from scipy.stats import multivariate_normal
 
-from beetle_omni_ros.bags.log import FlightLog
 from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.engine import Engine
@@ -42,38 +42,6 @@ FAINT = 1e-4            # information in units of the priors that does not count
 MOST_THRUST = 0.9       # of the largest thrust, without a simulator
 TRIALS = 3              # tasks that are checked before there is none
 Grams = dict[str, np.ndarray]       # manoeuvre -> (K, K) information of its block
-
-
-class Experimenter(Protocol):
-    """
-    What flies manoeuvres, see :mod:`beetle_omni_ros.flight.experiment`.
-
-    Attributes:
-        names, level: manoeuvres, and those of a robot whose rotors do not tilt.
-        duration, lead: of a manoeuvre and of the hover before the first one [s].
-        most: manoeuvres of a task.
-
-    """
-
-    names: tuple[str, ...]
-    level: tuple[str, ...]
-    duration: float
-    lead: float
-    most: int
-
-    def flown(self, names: Sequence[str], plant: RobotParameters | None = None
-              ) -> FlightLog | None:
-        """Fly manoeuvres with a plant, by default the robot file; None: a crash."""
-
-    def why_unsafe(self, names: Sequence[str], log: FlightLog) -> dict[str, str]:
-        """Manoeuvres without margin to a limit, each with that limit."""
-
-    def level_motion(self, names: Sequence[str], period: float
-                     ) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, 3) [m] and yaw (N,) [rad], from a start on the ground."""
-
-    def write(self, path: Path, names: Sequence[str], head: str) -> None:
-        """Write a task with a comment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,19 +151,14 @@ class Outlook:
         moments, rng = self.measured(information), np.random.default_rng(seed)
         least, found = log(1 / self._engine.alpha), []
         for k, (mean, covariance) in enumerate(moments):
-            z = mean + rng.normal(size=(SAMPLES, len(mean))) @ np.linalg.cholesky(covariance).T
-            odds = self.odds + np.stack([density(z, *own) for own in moments], axis=1)
+            z = rng.multivariate_normal(mean, covariance, SAMPLES, method='cholesky')
+            odds = self.odds + np.stack([multivariate_normal.logpdf(z, *own)
+                                         for own in moments], axis=1)
             order = np.sort(odds, axis=1)
             sure = order[:, -1] - order[:, -2] > least
             right = odds.argmax(axis=1) == k
             found.append([(sure & right).mean(), (sure & ~right).mean()])
         return np.array(found)
-
-
-def density(z: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """(N,) ln of the normal density of z (N, r), but for a constant."""
-    left = np.linalg.solve(np.linalg.cholesky(covariance), (z - mean).T)
-    return -0.5 * (left**2).sum(axis=0) - 0.5 * np.linalg.slogdet(covariance)[1]
 
 
 def chosen(outlook: Outlook, grams: Grams, most: int) -> list[str]:
@@ -247,14 +210,14 @@ class Planner:
     Args:
         robot: robot file.
         p: parameters of the gap finder.
-        experiments: simulated manoeuvres.
+        experiments: simulated manoeuvres, :class:`~beetle_omni_ros.flight.experiment.Experiments`.
         path: task to write.
 
     """
 
     robot: RobotParameters
     p: GapParameters
-    experiments: Experimenter
+    experiments: Any
     path: Path
 
     def __call__(self, engine: Engine, solution: Solution, result: dict,
