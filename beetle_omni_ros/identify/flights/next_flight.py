@@ -22,10 +22,11 @@ from scipy.stats import multivariate_normal
 from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.evidence import normal, Solution
+from beetle_omni_ros.identify.flights.evidence import log_prior, normal, Solution
 from beetle_omni_ros.identify.flights.flat import flat_flight
 from beetle_omni_ros.identify.flights.results import member_of, named_of, parameters, Starts
 from beetle_omni_ros.identify.flights.spectrum import blocks_of, pooled, WARM
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.inference.noise import few_blocks
 from beetle_omni_ros.identify.recording.bag import recording_of
 from beetle_omni_ros.identify.recording.flight import prepare, UnusableFlight
@@ -50,7 +51,7 @@ class Explanation:
     A set of entries that may be the truth.
 
     Attributes:
-        label: of the entry that distinguishes it, or 'none'.
+        label: of the entry that distinguishes it.
         chosen: indices of all its entries.
         odds: ln of its probability, but for a constant.
         mean, covariance: (K,) and (K, K) of all keys by the flights so far.
@@ -65,26 +66,19 @@ class Explanation:
 
 
 def hypotheses_of(engine: Engine, solution: Solution) -> list[Explanation]:
-    """The most probable one first: a set and its rivals, or single entries and none."""
-    judge, best = solution.judge, solution.best
+    """The most probable members of the first open set, each with the other named entries."""
+    best = solution.best
     unclear = [own for own in named_of(engine, solution, engine.alpha) if len(own[1]) > 1]
-    if unclear:
-        k, members = unclear[0]
-        rest = set(best) - {k}
-        given = {tuple(sorted(rest | {j})): j for j in members}
-    else:
-        varying = {k for k in best if solution.entries[k].varying}
-        given = {tuple(sorted({*varying, k})): k for k, entry in enumerate(solution.entries)
-                 if not entry.varying and k not in solution.banned and (k,) in solution.gains}
-        given[tuple(sorted(varying))] = -1
-    odds = {chosen: engine.gain(judge, chosen, best) for chosen in given}
-    first = sorted(odds, key=odds.get, reverse=True)[:MOST]         # type: ignore[arg-type]
+    if not unclear:
+        return []
     equations = normal(solution.spectra, engine.names, engine.flight)
+    k, members = unclear[0]
     found = []
-    for chosen in first:
-        mean, covariance = _posterior(engine, solution, equations, chosen)
-        label = solution.entries[given[chosen]].label if given[chosen] >= 0 else 'none'
-        found.append(Explanation(label, chosen, odds[chosen], mean, covariance))
+    for j in members[:MOST]:
+        own = tuple(sorted({*best, j} - ({k} - {j})))
+        found.append(Explanation(
+            solution.entries[j].label, own, engine.gain(solution.judge, own, best),
+            *_posterior(engine, solution, equations, own)))
     return found
 
 
@@ -100,15 +94,12 @@ def _posterior(engine, solution, equations, chosen):
     return covariance @ equations.right, covariance
 
 
-class Outlook:
-    """What manoeuvres are expected to decide between hypotheses."""
+class Gain:
+    """What the measurements of manoeuvres are worth."""
 
-    def __init__(self, engine: Engine, solution: Solution, hypotheses: Sequence[Explanation]):
-        self._engine, self.hypotheses = engine, list(hypotheses)
+    def __init__(self, engine: Engine, solution: Solution):
+        self._engine = engine
         self._blocks = sum(len(each.residual) for each in solution.spectra)
-        self._scale = np.hypot(engine.narrow, engine.typical)
-        odds = np.array([each.odds for each in hypotheses])
-        self.odds, self.weights = odds, np.exp(odds - np.logaddexp.reduce(odds))
 
     def information(self, grams: Sequence[np.ndarray]) -> np.ndarray:
         """(K, K) information of blocks of one flight without what differs between flights."""
@@ -117,6 +108,19 @@ class Outlook:
         inner = np.linalg.inv(total[np.ix_(own, own)] + np.diag(engine.flight[own]**-2))
         total = total - total[:, own] @ inner @ total[own]
         return total / few_blocks(engine.alpha / len(engine.entries), self._blocks + len(grams))
+
+
+
+class Outlook(Gain):
+    """What manoeuvres are expected to decide between hypotheses."""
+
+    def __init__(self, engine: Engine, solution: Solution, hypotheses: Sequence[Explanation]):
+        super().__init__(engine, solution)
+        self.hypotheses, self._scale = list(hypotheses), np.hypot(engine.narrow, engine.typical)
+        odds = np.array([each.odds for each in hypotheses])
+        self.odds, self.weights = odds, np.exp(odds - np.logaddexp.reduce(odds))
+        self.question = 'decides between ' + ' and '.join(each.label for each in hypotheses)
+        self.labels = [each.label for each in hypotheses]
 
     def measured(self, information: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Mean (r,) and covariance (r, r) of the measurements under each hypothesis."""
@@ -161,7 +165,58 @@ class Outlook:
         return np.array(found)
 
 
-def chosen(outlook: Outlook, grams: Grams, most: int) -> list[str]:
+class Sight(Gain):
+    """What manoeuvres are expected to show of single effects of typical size, if one is there."""
+
+    def __init__(self, engine: Engine, solution: Solution, names: Sequence[str]):
+        super().__init__(engine, solution)
+        self._info = normal(solution.spectra, engine.names, engine.flight).info
+        count = len(engine.entries)
+        self._least = log(1 / engine.alpha) + log_prior(0, count) - log_prior(1, count)
+        self.labels, self.weights = list(names), np.full(len(names), 1 / len(names))
+        self.question = f'names one of {len(names)} effects of typical size that are hidden now,'
+        self._keys = [[engine.indices((k,)) for k, entry in enumerate(engine.entries)
+                       if entry.name == name and not entry.varying] for name in names]
+
+    def _variances(self, information):
+        """For each effect, of each of its entries (d, d): of the estimate without and with it."""
+        engine, narrow = self._engine, self._engine.narrow
+        covariance = narrow[:, None] * np.linalg.inv(
+            narrow[:, None] * (self._info + information) * narrow + np.eye(len(narrow))) * narrow
+
+        def both(c):
+            values, vectors = np.linalg.eigh(
+                np.linalg.inv(covariance[np.ix_(c, c)]) - np.diag(narrow[c]**-2))
+            null = (vectors / np.maximum(values, 1e-9 * narrow[c].min()**-2)) @ vectors.T \
+                + np.diag(narrow[c]**2)
+            return null, null + np.diag(engine.typical[c]**2)
+        return [[both(c) for c in entries] for entries in self._keys]
+
+    def value(self, information: np.ndarray) -> float:
+        """Mean of the expected evidence over what is needed, at most one for each effect."""
+        return float(np.mean([min(max(_divergence(*both) for both in entries), self._least)
+                              for entries in self._variances(information)])) / self._least
+
+    def chances(self, information: np.ndarray, seed: int = 0) -> np.ndarray:
+        """(H, 2) probability that each effect is named if it is there, and 0."""
+        rng, found = np.random.default_rng(seed), []
+        for entries in self._variances(information):
+            null, wide = max(entries, key=lambda both: _divergence(*both))
+            zero = np.zeros(len(null))
+            z = rng.multivariate_normal(zero, wide, SAMPLES)
+            gain = multivariate_normal.logpdf(z, zero, wide) - multivariate_normal.logpdf(
+                z, zero, null)
+            found.append([(gain > self._least).mean(), 0.0])
+        return np.array(found)
+
+
+def _divergence(null, wide):
+    """Mean ln of the evidence [nat] for a normal density with a wide variance, if it is true."""
+    ratio = np.linalg.solve(null, wide)
+    return 0.5 * float(np.trace(ratio) - len(null) - np.linalg.slogdet(ratio)[1])
+
+
+def chosen(outlook: Outlook | Sight, grams: Grams, most: int) -> list[str]:
     """Manoeuvres, one after the other the one with which the value is largest."""
     names: list[str] = []
     parts: list[np.ndarray] = []
@@ -240,11 +295,13 @@ class Planner:
         """
         if result['verdict'] not in OPEN:
             return _without(f"{result['verdict']}: there is nothing to decide")
-        outlook = Outlook(engine, solution, hypotheses_of(engine, solution))
-        own = self.experiments
-        names = own.names if starts is not None else own.level
-        plants = [plant_of(engine, solution, each, self.robot, starts)
-                  for each in outlook.hypotheses[:SIMULATED if starts is not None else 0]]
+        own, hypotheses = self.experiments, hypotheses_of(engine, solution)
+        outlook = Outlook(engine, solution, hypotheses) if hypotheses else Sight(
+            engine, solution, result['hidden'] or [r['name'] for r in result['candidates'][:MOST]])
+        names, plants = own.level, []
+        if starts is not None:
+            names, plants = own.names, [plant_of(engine, solution, each, self.robot, starts)
+                                        for each in hypotheses[:SIMULATED]] or [weak(self.robot)]
         found, beyond = self._flown(engine, solution, names, None, starts is None)
         grams = {name: gram for name, gram in found if name not in beyond}
         for _ in range(TRIALS):
@@ -288,21 +345,29 @@ class Planner:
         own, path = self.experiments, self.path
         chances = outlook.chances(outlook.information(grams))
         right, wrong = outlook.weights @ chances
-        labels = [each.label.replace('_', ' ') for each in outlook.hypotheses]
         duration = own.lead + len(names) * own.duration
-        sentence = (f"{path}: {duration:.0f} s, decides between {' and '.join(labels)} with a "
-                    f'probability of {right:.2f}, and wrongly with {wrong:.2f}')
+        question = outlook.question.replace('_', ' ')
+        sentence = f'{path}: {duration:.0f} s, {question} with a probability of {right:.2f}'
+        sentence += f', and wrongly with {wrong:.2f}' if wrong else ''
         own.write(path, names, f'Written by beetle_omni gap --next.\n{sentence}.\n'
                                f"After {own.lead:g} s of hover: {'; '.join(names)}.")
         return {'task': str(path), 'sentence': sentence, 'manoeuvres': list(names),
                 'probability': float(right), 'wrong': float(wrong), 'hypotheses': [
-                    {'name': each.label, 'weight': float(weight), 'probability': float(chance[0]),
-                     'wrong': float(chance[1])} for each, weight, chance in zip(
-                        outlook.hypotheses, outlook.weights, chances, strict=True)]}
+                    {'name': label, 'weight': float(weight), 'probability': float(chance[0]),
+                     'wrong': float(chance[1])} for label, weight, chance in zip(
+                        outlook.labels, outlook.weights, chances, strict=True)]}
 
 
 def _without(reason):
     return {'next_flight': {'task': None, 'sentence': f'{reason}, and no task is written'}}
+
+
+def weak(robot: RobotParameters) -> RobotParameters:
+    """The robot, heavier and with less thrust by their typical deviations."""
+    mass, thrust = (TREATMENTS[name].sizes[key].typical for name, key in (
+        ('mass', 'mass'), ('thrust_coefficient', 'scale')))
+    return robot_with(robot, {**robot.effects, 'mass': {'mass': robot.mass * (1 + mass)},
+                              'thrust_coefficient': {'scale': 1 - thrust}})
 
 
 def plant_of(engine: Engine, solution: Solution, hypothesis: Explanation, robot: RobotParameters,
