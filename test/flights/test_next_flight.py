@@ -5,11 +5,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from beetle_omni_ros.flight.experiment import Experiments
+from beetle_omni_ros.identify.flights.evidence import log_prior
 from beetle_omni_ros.identify.flights.flat import flat_flight
-from beetle_omni_ros.identify.flights.next_flight import chosen, Explanation, Outlook, Planner
+from beetle_omni_ros.identify.flights.keys import Entry
+from beetle_omni_ros.identify.flights.next_flight import (
+    chosen,
+    Explanation,
+    Outlook,
+    Planner,
+    Sight,
+)
+from beetle_omni_ros.identify.flights.spectrum import spectrum
 from beetle_omni_ros.identify.flights.verdict import load_tables
 from beetle_omni_ros.identify.recording.table import Format
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -96,3 +105,28 @@ def crazyflie():
     robot = RobotParameters.load(share_path('params') / 'crazyflie.yaml')
     path = sorted((Path(__file__).parents[1] / 'data/nanobench').glob('*.csv.gz'))[0]
     return load_tables([path], robot, Format.load('nanobench'))[0]
+
+
+def test_an_effect_is_named_with_the_probability_that_its_evidence_suffices():
+    """A key alone: the threshold of its evidence is one of the size of the estimate."""
+    rng, names = np.random.default_rng(3), ['one', 'two']
+    slopes = rng.normal(size=(1600, 1, 2))
+    found = spectrum(-slopes @ [0.0, 0.0], slopes, np.ones((1600, 1), dtype=bool), 0.01,
+                     np.full(1, 1e-6), np.inf, [np.arange(1)])
+    found.noise[:] = 16.0
+    engine = SimpleNamespace(
+        names=names, narrow=np.array([0.01, 1e-6]), typical=np.array([0.3, 0.3]), alpha=0.05,
+        flight=np.zeros(2), entries=[Entry(name, (name,)) for name in names],
+        indices=lambda chosen: list(chosen))
+    sight = Sight(engine, SimpleNamespace(spectra=[found]), ['one'])
+    more = gram([30.0, 0.0])[:2, :2]
+    info = found.grams()[0].sum(axis=(0, 1))[0, 0] + more[0, 0]
+    null = 1 / info + 0.01**2
+    wide = null + 0.3**2
+    # ln B > least for an estimate beyond a limit
+    least = np.log(20) + log_prior(0, 2) - log_prior(1, 2)
+    limit = np.sqrt((least + 0.5 * np.log(wide / null)) * 2 / (1 / null - 1 / wide))
+    expected = 2 * norm.sf(limit / np.sqrt(wide))
+    assert 0.2 < expected < 0.9
+    assert sight.chances(more)[0] == pytest.approx([expected, 0.0], abs=0.06)
+    assert sight.value(0 * more) < sight.value(more) <= 1.0
