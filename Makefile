@@ -24,8 +24,8 @@ setup:  ## make .venv with all but training (also: PYTHON=..., EXTRAS=...)
 setup-train:  # the same with what training needs
 	@PYTHON='$(PYTHON)' .ci/setup train
 
-fly: setup  ## fly the waypoints in real time through ROS nodes; the bag is in runs_out/
-	$(TOOL) fly --controller nmpc --task waypoints $(ARGS)
+fly: setup  ## fly the waypoints through ROS nodes, seen in the browser; bag and film in runs_out/
+	$(TOOL) fly --controller nmpc --task waypoints --view $(ARGS)
 
 test: setup-train  ## the whole test suite
 	@.ci/test $(ARGS)
@@ -39,6 +39,8 @@ lint: setup  ## style of every Python file, types of the core
 
 docs: setup  ## the site with reference pages from the code, all links checked; to build/site/
 	.venv/bin/python -m mkdocs build --strict
+	@echo 'files: build/site/index.html'
+	@echo 'next:  .venv/bin/python -m http.server --directory build/site'
 
 evaluate: setup  ## 100 random poses, in one process and faster than real time
 	@mkdir -p runs_out
@@ -52,16 +54,14 @@ faults: setup  ## every listed fault from hover, on the move, upside down; to ru
 	@mkdir -p runs_out
 	$(TOOL) faults --output runs_out/faults $(ARGS)
 
-gap: setup  ## hide a drag in the plant, fly, identify it, fly with the corrected model; to runs_out/gap/
+gap: setup  ## hide a drag and slow rotors, fly, identify them, fly both controllers corrected; to runs_out/gap/
 	@rm -rf $(GAP) && mkdir -p $(GAP)
-	@printf 'extends: $(CURDIR)/params/robot.yaml\neffects: {rotor_drag: {coefficient: 1.2}}\n' \
+	@printf 'extends: $(CURDIR)/params/robot.yaml\neffects: {rotor_drag: {coefficient: 1.2}, rotor_lag: {time_constant: 0.13}}\n' \
 	    >$(GAP)/plant.yaml
 	for seed in 1 2 3; do $(TOOL) evaluate --controllers nmpc --task random8 --seed $$seed \
 	    --plant $(GAP)/plant.yaml --bag $(GAP)/flight$$seed || exit; done
-	$(TOOL) gap $(GAP)/flight1 $(GAP)/flight2 --holdout $(GAP)/flight3 --apply $(GAP)/robot.yaml \
-	    --json $(GAP)/gap.json --report $(GAP)/gap.html $(ARGS)
-	for robot in params/robot.yaml $(GAP)/robot.yaml; do $(TOOL) evaluate --controllers nmpc \
-	    --task lemniscate --plant $(GAP)/plant.yaml --robot $$robot || exit; done
+	$(TOOL) improve $(GAP)/flight1 $(GAP)/flight2 $(GAP)/flight3 --plant $(GAP)/plant.yaml \
+	    --output $(GAP) $(ARGS)
 
 report: setup  ## one HTML page about the runs in runs_out/ (or RUNS='DIR...')
 	@runs='$(RUNS)'; for bag in runs_out/*/metadata.yaml; do \

@@ -91,9 +91,21 @@ GYM = [
     'gymnasium>=1.0,<2',
 ]
 
+# show/notebook.py alone: tables, and what plotly needs to draw in a cell.
+NOTEBOOK = [
+    'nbformat>=5',
+    'pandas>=2,<4',
+]
+
+# show/rerun_view.py alone.
+RERUN = [
+    'rerun-sdk>=0.34,<1',
+]
+
 # colcon looks for pytest under the name `test` before it runs pytest.
 TEST = [
     *GYM,
+    *NOTEBOOK,
     'hypothesis>=6.100',
     'mcap-ros2-support>=0.5,<1',     # reads what the package writes
     'onnx>=1.16',
@@ -139,6 +151,8 @@ setup(
         'hardware': HARDWARE,
         'train': TRAIN,
         'gym': GYM,
+        'notebook': NOTEBOOK,
+        'rerun': RERUN,
         'test': TEST,
         'dev': DEVELOPMENT,
     },

@@ -7,12 +7,13 @@ The functions for notebooks. Imports are delayed until a function is called::
 
     robot = bo.robot()                                    # parameters, from a file or shipped
     log = bo.simulate('nmpc', [[0, 0, 1, 90, 0, 0]])      # a flight as numpy arrays
+    log.metrics(), log.plot(), log.to_pandas(), log.report('flight.html')
     loop = bo.simulation('nmpc')                          # a robot in the air, to be stepped
     table = bo.evaluate([MyController, 'rl'], 'waypoints')      # metrics, and a table in print
     log = bo.read_run('runs_out/flight')                  # a recorded bag as numpy arrays
     found = bo.find_gap(['flight1', 'flight2'])           # effects that the model lacks
 
-The folder examples/ contains short examples.
+The folder examples/ contains short examples and a notebook.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
-    from beetle_omni_ros.bags.log import FlightLog
     from beetle_omni_ros.flight.loop import FlightLoop
     from beetle_omni_ros.model.parameters import RobotParameters
+    from beetle_omni_ros.show.notebook import NotebookLog
 
 __version__ = '0.1.0'
 __all__ = ['evaluate', 'find_gap', 'read_run', 'robot', 'simulate', 'simulation', 'trajectory']
@@ -45,7 +46,7 @@ def robot(file: str | Path | None = None) -> RobotParameters:
 def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
              robot: RobotParameters | str | Path | None = None,
              plant: RobotParameters | str | Path | None = None, conditions: str = 'nominal',
-             seed: int = 0, bag: str | Path | None = None) -> FlightLog:
+             seed: int = 0, bag: str | Path | None = None) -> NotebookLog:
     """
     Fly a task in this process, as `beetle_omni evaluate` does.
 
@@ -61,20 +62,24 @@ def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
         bag: new folder to record a bag in.
 
     Returns:
-        The flight; ``log.meta['crashed']`` is true if the robot touched the ground.
+        The flight, with times from 0 and the methods ``metrics``, ``plot``, ``to_pandas`` and
+        ``report``; ``log.meta['crashed']`` is true if the robot touched the ground.
 
     Raises:
         ParameterError, RunError: with a message of one line.
 
     """
     from beetle_omni_ros.flight.evaluate import fly
+    from beetle_omni_ros.show.notebook import NotebookLog
     believed, flown = _robot(robot), _task(task, seed)
     given = robot is None or robot is believed
-    return fly(_reference(controller), flown, robot=believed,
-               plant=believed if plant is None else _robot(plant), conditions=conditions,
-               seed=seed, bag=_path(bag), meta={
-                   'task': flown.name, 'conditions': conditions, 'seed': seed,
-                   'robot': 'params/robot.yaml' if given else str(robot), 'version': __version__})
+    log = fly(_reference(controller), flown, robot=believed,
+              plant=believed if plant is None else _robot(plant), conditions=conditions,
+              seed=seed, bag=_path(bag), meta={
+                  'task': flown.name, 'conditions': conditions, 'seed': seed,
+                  'robot': 'params/robot.yaml' if given else str(robot), 'version': __version__})
+    log.source = str(bag or '')
+    return NotebookLog.of(log, flown)
 
 
 def simulation(controller: str | Callable = 'nmpc', *,
@@ -93,9 +98,12 @@ def simulation(controller: str | Callable = 'nmpc', *,
 
     """
     from beetle_omni_ros.flight.evaluate import prepared
+    from beetle_omni_ros.show.notebook import NotebookLog
     believed = _robot(robot)
     loop = prepared(_reference(controller), robot=believed, conditions=conditions, seed=seed,
                     plant=believed if plant is None else _robot(plant))
+    recording = loop.recording
+    loop.recording = lambda: NotebookLog.of(recording())
     loop.take_off()
     return loop
 
@@ -125,15 +133,16 @@ def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any =
         console=Console(quiet=quiet))
 
 
-def read_run(path: str | Path) -> FlightLog:
+def read_run(path: str | Path) -> NotebookLog:
     """
     Read a recorded bag, a rosbag2 folder or one of its files, into numpy arrays.
 
-    ``warnings`` of the flight list missing topics and damage. A ParameterError of one line refuses
-    a file that is no bag.
+    The flight is as that of :func:`simulate`; its ``warnings`` list missing topics and damage. A
+    ParameterError of one line refuses a file that is no bag, and lists the runs in a folder.
     """
     from beetle_omni_ros.bags.bag import read_bag
-    return read_bag(path)
+    from beetle_omni_ros.show.notebook import NotebookLog
+    return NotebookLog.of(read_bag(path))
 
 
 def find_gap(runs: Sequence[str | Path], holdout: Sequence[str | Path] = (), *,

@@ -12,6 +12,7 @@ from typer import Argument, echo, Option
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, OWNER
 from beetle_omni_ros.identify_commands import identify
+from beetle_omni_ros.improve import improve
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.options import (
     Commands,
@@ -22,13 +23,13 @@ from beetle_omni_ros.options import (
     DomainOption,
     FAILED,
     FaultsOption,
+    FullOption,
     JobsOption,
     JsonOption,
     KNOWN,
     NamespaceOption,
     NmpcOption,
     one_of,
-    OtherRobotOption,
     OutputOption,
     PageOption,
     PlantOption,
@@ -56,15 +57,14 @@ def fly(controller: ControllerOption = DEFAULT,
             'emulated (default): commands go through joint_bridge_node, rotor_bridge_node, serial '
             'ports and emulated devices; direct: they go straight to the simulated '
             'plant.'))] = None,
-        clock: Annotated[str, Option(callback=one_of, metavar='system|simulated', help=(
+        clock: Annotated[str, Option(callback=one_of, metavar='auto|system|simulated', help=(
             'system: real time; simulated: simulated time on /clock, which waits for late nodes, '
-            'with direct actuators, for a computer that is too slow for real '
-            'time.'))] = 'system',
+            'with direct actuators; auto: simulated if this computer is too slow for real time, '
+            'measured before the start.'))] = 'auto',
         robot: RobotOption = None,
         plant: PlantOption = None,
         nmpc: NmpcOption = None,
         policy: PolicyOption = None,
-        allow_other_robot: OtherRobotOption = False,
         standby: Annotated[bool, Option('--standby/--alone', help=(
             'Run the other controllers on standby, to be selected in flight, or only the active '
             'controller.'))] = True,
@@ -72,7 +72,9 @@ def fly(controller: ControllerOption = DEFAULT,
         components: ComponentOption = None,
         domain_id: DomainOption = None,
         view: Annotated[bool, Option('--view', help=(
-            'Show the flight in the browser, as beetle_omni view does.'))] = False,
+            'Show the flight in the browser, as beetle_omni view does, and write a page that '
+            'plays it into the folder of the bag.'))] = False,
+        full: FullOption = False,
         json_path: JsonOption = None):
     """
     Fly the simulated robot with the whole ROS graph in real time.
@@ -89,8 +91,9 @@ def fly(controller: ControllerOption = DEFAULT,
 
 
 @app.command()
-def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,...', help=(
-                 f'Controllers to fly one after the other: {KNOWN}.'))] = DEFAULT,
+def evaluate(controllers: Annotated[str, Option(
+                 '--controllers', '--controller', callback=several, metavar='NAME,...', help=(
+                     f'Controllers to fly one after the other: {KNOWN}.'))] = DEFAULT,
              task: TaskOption = 'random100',
              conditions: ConditionsOption = 'nominal',
              seed: SeedOption = 0,
@@ -98,7 +101,6 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
              plant: PlantOption = None,
              nmpc: NmpcOption = None,
              policy: PolicyOption = None,
-             allow_other_robot: OtherRobotOption = False,
              without: Annotated[str, Option(metavar='LAYER,...', help=(
                  'Layers of the guidance that are off: unwinding, routing, trimming, or '
                  'all.'))] = '',
@@ -111,6 +113,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
                      'direct: commands go straight to the simulated plant; emulated: through '
                      'drivers, serial ports and emulated devices, in real time.'))] = 'direct',
              components: ComponentOption = None,
+             full: FullOption = False,
              json_path: JsonOption = None):
     """
     Fly a task in one process, deterministic and without a clock.
@@ -122,8 +125,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
                            for name in controllers):
         raise ParameterError(f'--without {without}: no controller with guidance among '
                              f"{', '.join(controllers)}")
-    options = {name: ControllerOptions(allow_other_robot=allow_other_robot, without=without)
-               for name in controllers}
+    options = {name: ControllerOptions(without=without) for name in controllers}
     for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
         name = OWNER[option]
         if file and name not in controllers:
@@ -136,14 +138,17 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
     results = run_evaluate(controllers=controllers, task=task, conditions=conditions, robot=robot,
                            plant=plant, seed=seed, bag=bag, json_path=json_path,
                            faults=faults, actuators=actuators, components=components or (),
-                           options=options)
+                           options=options, full=full)
+    if bag is None:
+        echo('next:  the same with --bag DIR records the flight; with --full it prints everything')
     return FAILED if any(map(failed, results.values())) else 0
 
 
 @app.command()
-def compare(controllers: Annotated[str | None, Option(callback=several, metavar='NAME,...', help=(
-                f"Controllers: {KNOWN}. Default: {', '.join(registry.COMPARED)}; a missing "
-                'policy is left out.'))] = None,
+def compare(controllers: Annotated[str | None, Option(
+                '--controllers', '--controller', callback=several, metavar='NAME,...', help=(
+                    f"Controllers: {KNOWN}. Default: {', '.join(registry.COMPARED)}; a missing "
+                    'policy is left out.'))] = None,
             tasks: Annotated[str | None, Option(callback=several, metavar='TASK,...', help=(
                 'Names or pose files. Default: those of the publication.'))] = None,
             conditions: Annotated[str, Option(callback=several, metavar='NAME,...', help=(
@@ -216,6 +221,7 @@ def report(paths: Annotated[list[Path], Argument(metavar='RUN...', help=(
            output: Annotated[Path, Option(
                '--output', '-o', callback=writable, metavar='FILE', help='The page to write.')]
            = Path('report.html'),
+           full: FullOption = False,
            json_path: JsonOption = None):
     """
     Write one HTML page with metrics and plots of one or more runs.
@@ -236,13 +242,17 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
              'Address at which the page is served; 0.0.0.0: to the whole network.'))]
          = '127.0.0.1',
          port: Annotated[int, Option(
-             metavar='N', min=1, max=65535, help='Port of the page.')] = 8080):
+             metavar='N', min=1, max=65535, help='Port of the page.')] = 8080,
+         rerun: Annotated[bool, Option('--rerun', help=(
+             'Open the runs in Rerun instead; needs the extra rerun.'))] = False):
     """
     Show a running graph or recorded runs in 3D in the browser.
 
     Prints the address of the page, which needs no network, and runs until Ctrl-C. Example:
     beetle_omni view my_run/rl my_run/nmpc
     """
+    if rerun and not runs:
+        raise ParameterError('--rerun: expected RUN with it, a recording')
     page = {'host': host, 'port': port}
     graph = {'namespace': namespace, 'domain_id': domain_id}
     if not runs:
@@ -253,6 +263,10 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
         if value not in ('', None):
             raise ParameterError(f"--{name.replace('_', '-')}: expected without RUN, which is a "
                                  'recording')
+    if rerun:
+        from beetle_omni_ros.show.rerun_view import run_rerun
+        run_rerun(runs)
+        return
     from beetle_omni_ros.show.recorded import run_view
     run_view(runs, **page)
 
@@ -295,6 +309,9 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
     return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
                    tolerances=tolerances, form=form, alpha=alpha, next_task=next_task,
                    experiments=Experiments)
+
+
+app.command()(improve)
 
 
 @app.command()
@@ -346,6 +363,9 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
           skip: Annotated[list[str], Option(metavar='servos|board|ros', help=(
               'Skip a part; may be repeated.'))] = (),
           namespace: NamespaceOption = '',
+          timing: Annotated[bool, Option('--timing', help=(
+              'Only measure the cycles of estimator and controllers on this computer; 1 min.'))
+              ] = False,
           json_path: JsonOption = None):
     """
     Check ports, devices and clocks of the real robot before flight.
@@ -358,9 +378,12 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
         return listen_to_ros(duration, namespace)
 
     from beetle_omni_ros.drivers.check import run_check
+    measure = None
+    if timing:
+        from beetle_omni_ros.flight.timing import check_timing as measure
     return run_check(listen=listen, servo_port=servo_port, board_port=board_port,
                      servo_bus=servo_bus, motor_board=motor_board, robot=robot, seconds=seconds,
-                     skip=tuple(skip), json_path=json_path)
+                     skip=tuple(skip), measure=measure, json_path=json_path)
 
 
 @app.command()

@@ -66,7 +66,7 @@ def whole(param: CallbackParam, text: str | None) -> list[int] | None:
 
 
 ControllerOption = Annotated[str, Option(
-    metavar='NAME', help=f'The active controller: {KNOWN}.')]
+    '--controller', '--controllers', metavar='NAME', help=f'The active controller: {KNOWN}.')]
 TaskOption = Annotated[str, Option(metavar='TASK', help=(
     'CSV file of poses, YAML file of set points, or waypoints, randomN (random100), lemniscate, '
     'lemniscate_large, hover, force, force_down, force_up, torque, torque_pulses, wind, pushes, '
@@ -92,8 +92,6 @@ PolicyOption = Annotated[Path | None, Option(
     exists=True, dir_okay=False, metavar='FILE', help=(
         f"Policy (ONNX) for the controller '{registry.OWNER['--policy']}'. Default: the shipped "
         'one.'))]
-OtherRobotOption = Annotated[bool, Option('--allow-other-robot', help=(
-    'Fly a policy although it was trained for other robot parameters.'))]
 DomainOption = Annotated[int | None, Option(
     metavar='N', min=0, max=101, help='ROS domain. Default: ROS_DOMAIN_ID; of fly, a free one.')]
 NamespaceOption = Annotated[str, Option(
@@ -111,6 +109,8 @@ OutputOption = Annotated[Path | None, Option(
     '--output', '-o', metavar='DIR', help='Folder for page, pictures or Markdown, and JSON.')]
 JsonOption = Annotated[Path | None, Option(
     '--json', callback=writable, metavar='FILE', help='Write the results as JSON.')]
+FullOption = Annotated[bool, Option('--full', help=(
+    'Print the whole table: largest errors, effort, CPU times, parts of the task, every pose.'))]
 PageOption = Annotated[Path | None, Option(
     '--report', callback=writable, metavar='FILE', help=(
         'Write a self-contained HTML page with plots.'))]

@@ -59,7 +59,7 @@ def measure(folder: Path, actuators: str, seconds: float) -> dict:
     sampler = threading.Thread(target=sample_cpu, args=(samples, stop))
     sampler.start()
     with bare_timer() as counted:
-        status = run_fly(task=str(task), actuators=actuators, bag=bag,
+        status = run_fly(task=str(task), actuators=actuators, clock='system', bag=bag,
                          console=Console(quiet=True))
     stop.set()
     sampler.join()

@@ -100,8 +100,7 @@ def fly_one(trial: Trial, robot: str | None, plant: str, policy: Path | None) ->
     task = make_task(f'random{trial.poses}', trial.seed)
     log = fly(trial.controller, task, robot=known, plant=true, seed=trial.seed,
               conditions='nominal' if trial.kind in (DRAWN, UNMET) else trial.kind,
-              options={trial.controller: ControllerOptions(
-                  policy=policy, allow_other_robot=True)})
+              options={trial.controller: ControllerOptions(policy=policy)})
     result = metrics(log, task)
     poses, ended = result['poses'], result.get('ended', '')
     alarms = [*log.named_faults(), ended, result.get('controller_error', '')]

@@ -111,11 +111,11 @@ STATUS = """\
 | 130 | interrupted |
 """
 TIMES = """The functions of `import beetle_omni_ros as bo`, which `help` shows too. They need no
-ROS. Short scripts are in `examples/`.
+ROS. Short scripts and a notebook are in `examples/`.
 
-The times of a flight are absolute, in seconds since 1970-01-01 UTC; `log.imu.t - log.start` is the
-time since its start. The times of a `TrajectoryTarget`, and the argument of `target.at(t)`, are on
-the same clock.
+The times of a flight begin at 0, its first sample; `log.epoch` is this moment in seconds since
+1970-01-01 UTC on the clock of the flight. The times of a `TrajectoryTarget`, and the argument of
+`target.at(t)`, are on the same clock. A `NotebookLog` is a `FlightLog` with more methods.
 """
 
 
@@ -315,18 +315,25 @@ def python() -> str:
     import beetle_omni_ros as module
     from beetle_omni_ros.bags import log
     from beetle_omni_ros.control import base
+    from beetle_omni_ros.show.notebook import NotebookLog
     text = [f'# Python\n\n{MADE}\n{TIMES}']
     for name in module.__all__:
         found = getattr(module, name)
-        # `robot` is a subpackage that can be called.
-        function = found if inspect.isfunction(found) else type(found).__call__
-        given = [one.replace(annotation=inspect.Parameter.empty) for one in
-                 inspect.signature(function).parameters.values() if one.name != 'self']
-        text.append(_documented(name, f'bo.{name}{inspect.Signature(given)}', function))
-    for kind in (log.FlightLog, log.Series, base.PoseTarget, base.TrajectoryTarget,
+        text.append(_documented(name, f'bo.{name}{_signature(found)}', found))
+    for kind in (NotebookLog, log.FlightLog, log.Series, base.PoseTarget, base.TrajectoryTarget,
                  base.Reference):
         text.append(_documented(kind.__name__, kind.__name__, kind))
+        if kind is NotebookLog:
+            text += [_documented(name, f'log.{name}{_signature(getattr(kind, name))}',
+                                 getattr(kind, name))
+                     for name in ('metrics', 'plot', 'to_pandas', 'report')]
     return ''.join(text)
+
+
+def _signature(function):
+    return inspect.Signature([one.replace(annotation=inspect.Parameter.empty) for one in
+                              inspect.signature(function).parameters.values()
+                              if one.name != 'self'])
 
 
 def _documented(name, call, documented):

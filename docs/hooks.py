@@ -1,13 +1,29 @@
-"""Changes of the site: pages made from code, and bars in code of tables."""
+"""Changes of the site: pages made from code, bars in code of tables, the repository's address."""
 
 from pathlib import Path
 import re
+import subprocess
 import sys
 
 from mkdocs.structure.files import File
 
 sys.path.insert(0, str(Path(__file__).parent))
 from generate_reference import PAGES
+
+
+def on_config(config):
+    """
+    Link to the repository that this is a checkout of, if it has an address.
+
+    The theme would ask a forge for its stars; a link of the footer asks nothing.
+    """
+    found = subprocess.run(['git', 'config', 'remote.origin.url'], cwd=Path(__file__).parent,
+                           capture_output=True, text=True, check=False).stdout.strip()
+    address = re.sub(r'^git@([^:]+):', r'https://\1/', found).removesuffix('.git')
+    if re.match(r'https?://[^@]*$', address):
+        config.extra['social'] = [{'icon': 'material/source-repository', 'name': 'Repository',
+                                   'link': address}]
+    return config
 
 
 def on_files(files, config):

@@ -1,29 +1,43 @@
 """
-Fly and draw the pictures of the tutorials and of gap: ``python docs/make_pictures.py [NAME...]``.
+Fly and draw the pictures of the pages: ``python docs/make_pictures.py [NAME...]``.
 
-Pictures are written to docs/tutorials/pictures/. Each takes up to a minute; ``hardware_flight``
-needs ROS.
+Without a name all are drawn that are stale: their function, the table of colours or a file that
+they read has changed. ``docs/pictures/inputs.json`` has the digests, and test/docs compares them.
+``hardware_flight`` needs ROS, films need an off-screen OpenGL. Those of OTHERS have another
+command, which is printed if they are stale; a name then records that it has been run.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+import inspect
+import json
+import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 import tempfile
 
+import drawings
+import film
 import matplotlib
 from matplotlib.figure import Figure
 import numpy as np
 
 import beetle_omni_ros as bo
 from beetle_omni_ros.bags.log import motion
+from beetle_omni_ros.flight import comparison_page
+from beetle_omni_ros.flight.campaign import digest
 from beetle_omni_ros.identify.flights.page import picture_of
 from beetle_omni_ros.model import rotations
-from beetle_omni_ros.show.figures import COLOURS, FAINT, STYLE
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.show import figures, scene
+from beetle_omni_ros.show.figures import AFTER, BEFORE, colours_of, FAINT, INK, PARTS, STYLE
 
-ROOT = Path(__file__).resolve().parents[1]
-FOLDER = ROOT / 'docs' / 'tutorials' / 'pictures'
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
+INPUTS = DOCS / 'pictures' / 'inputs.json'
 DOTS = 110      # per inch
 POSE = 8.0      # [s] of a pose
 TASK = 'random2'
@@ -58,7 +72,7 @@ def named(axes, title, x, y):
 def drawn_errors(logs, title, end):
     """Position and attitude errors of several flights against time."""
     drawn, (left, right) = figure(2)
-    for (label, log), colour in zip(logs.items(), COLOURS):
+    for (label, log), colour in zip(logs.items(), colours_of(logs.values())):
         times, _, position, angle = flown(log, end)
         left.semilogy(times, position, color=colour, label=label)
         right.semilogy(times, angle, color=colour, label=label)
@@ -85,8 +99,9 @@ def own_trajectory():
     scope: dict = {}
     exec(blocks_of('own_trajectory', 'python')[0].partition('results =')[0], scope)
     drawn, (left, right) = figure(2, 3.2)
-    for name, colour in zip(('nmpc', 'rl'), COLOURS):
-        times, path, position, _ = flown(bo.simulate(name, scope['task']))
+    logs = {name: bo.simulate(name, scope['task']) for name in ('nmpc', 'rl')}
+    for (name, log), colour in zip(logs.items(), colours_of(logs.values())):
+        times, path, position, _ = flown(log)
         on = times > POSE
         left.plot(path[on, 0], path[on, 1], color=colour, label=name)
         right.plot(times[on] - POSE, 1000 * position[on], color=colour, label=name)
@@ -115,7 +130,8 @@ def own_robot():
         (folder / 'heavy.yaml').write_text(blocks_of('own_robot', 'yaml')[0])
         for command in blocks_of('own_robot', 'sh')[:2]:
             subprocess.run(['bash', '-ec', command], cwd=folder, check=True,
-                           stdout=subprocess.DEVNULL)
+                           stdout=subprocess.DEVNULL, env={**os.environ, 'PATH': os.pathsep.join(
+                               [str(Path(sys.executable).parent), os.environ['PATH']])})
         return drawn_errors({name: bo.read_run(folder / name)
                              for name in ('known', 'wrong', 'slow')}, 'Two poses', 2 * POSE)
 
@@ -131,13 +147,13 @@ def own_gap():
         found = bo.find_gap([folder / 'flight1'], holdout=[folder / 'flight2'])
     drawn, (left, right) = figure(2)
     bars = [found['gap_before'], found['gap_after'], found['noise_floor']]
-    left.bar(['before', 'after', 'noise'], bars, color=[COLOURS[1], COLOURS[2], FAINT], width=0.6)
+    left.bar(['before', 'after', 'noise'], bars, color=[BEFORE, AFTER, FAINT], width=0.6)
     named(left, 'Gap on the flight that judges', '', 'gap, in units of the noise')
     mass = found['effects'][0]['parameters']['mass']
     low, high = mass['interval']
     right.errorbar([mass['value']], [1], xerr=[[mass['value'] - low], [high - mass['value']]],
-                   fmt='o', color=COLOURS[2], capsize=4, label='found, 95 % interval')
-    right.plot([3.3], [1], 'x', color=COLOURS[1], markersize=9, label='true')
+                   fmt='o', color=AFTER, capsize=4, label='found, 95 % interval')
+    right.plot([3.3], [1], 'x', color=INK, markersize=9, label='true')
     right.plot([3.0386], [1], 's', color=FAINT, label='robot file')
     right.set(yticks=[], ylim=(0.8, 1.4))
     right.legend(loc='upper center')
@@ -162,7 +178,7 @@ def hardware_flight():
         log = bo.read_run(Path(name) / 'bag')
     start = log.targets[0].stamp
     drawn, (left, right) = figure(2)
-    for k, colour in enumerate(COLOURS[:4]):
+    for k, colour in enumerate(PARTS):
         left.plot(log.joint.t - start, np.degrees(log.joint.position[:, k]), color=colour,
                   label=f'gimbal{k + 1}')
         left.plot(log.command.t - start, np.degrees(log.command.tilt[:, k]), color=colour,
@@ -170,23 +186,118 @@ def hardware_flight():
     left.legend(ncols=2)
     left.set_xlim(6, 12)
     named(left, 'Tilt, measured (line) and asked for (dots)', 'time [s]', 'angle [deg]')
-    right.plot(log.battery.t - start, log.battery.voltage, color=COLOURS[0])
+    right.plot(log.battery.t - start, log.battery.voltage, color=INK)
     named(right, 'Pack', 'time [s]', 'voltage [V]')
     return drawn
 
 
-PICTURES = {made.__name__: made for made in (first_flight, own_trajectory, own_controller,
-                                             own_robot, own_gap, real_gap, hardware_flight)}
+def flight():
+    """Film of both controllers at the waypoints and upside down."""
+    return [film.panel(bo.simulate(name, film.task()), label)
+            for name, label in (('rl', 'RL'), ('nmpc', 'NMPC'))]
+
+
+def gap():
+    """Film of a flight with a weak rotor, and what the model expects before and after `gap`."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        plant, corrected = folder / 'plant.yaml', folder / 'corrected.yaml'
+        plant.write_text('extends: robot.yaml\n'
+                         'effects: {rotor_thrust_coefficient: {scale: [1, 1, 0.9, 1]}}\n')
+        for seed in range(3):
+            bo.simulate('nmpc', 'random8', plant=plant, seed=seed, bag=folder / f'{seed}')
+        bo.find_gap([folder / f'{seed}' for seed in range(3)], apply=corrected, quiet=True)
+        log = bo.simulate('nmpc', film.task(), plant=plant)
+        return [film.panel(log, 'model of the file', RobotParameters.load(), BEFORE),
+                film.panel(log, 'corrected model', RobotParameters.load(corrected), AFTER)]
+
+
+# Picture below docs/ -> its function, and the files that it reads.
+TUTORIALS, SHIPPED = 'tutorials/pictures', ('policies/rl.onnx', 'params/robot.yaml')
+PICTURES: dict[str, tuple[Callable, tuple[str, ...]]] = {
+    **{f'{TUTORIALS}/{made.__name__}.png': (made, read) for made, read in (
+        (first_flight, ()), (own_trajectory, ('docs/tutorials/own_trajectory.md',)),
+        (own_controller, ('docs/tutorials/own_controller.md',)),
+        (own_robot, ('docs/tutorials/own_robot.md',)), (own_gap, ()),
+        (real_gap, ('params/crazyflie.yaml', 'test/data/nanobench/*.csv.gz')),
+        (hardware_flight, ()))},
+    'pictures/flight.gif': (flight, SHIPPED), 'pictures/gap.gif': (gap, SHIPPED),
+    **{f'pictures/{made.__name__}.svg': (made, read) for made, read in (
+        (drawings.architecture, ('beetle_omni_ros/ros/graph.py',)),
+        (drawings.real_flights, ('params/crazyflie.yaml', 'test/data/nanobench/*.csv.gz')),
+        (drawings.frames, ('params/robot.yaml',)), (drawings.wiring, ()))}}
+# Pattern below docs/ -> the command that draws other pictures, and the functions that do it.
+OTHERS: dict[str, tuple[str, tuple[Callable, ...]]] = {
+    'comparison/*_convergence_*.png': ('make compare', (
+        comparison_page.convergence, figures.legend)),
+    'comparison/*_errors_*.png': ('make compare', (comparison_page.in_time, figures.legend)),
+    'pictures/view.png': ('beetle_omni view RUN RUN, photographed in a browser', (scene.Room,))}
+
+
+def sources(function: Callable) -> str:
+    """Text of a class, or of a function and the functions of its file that it calls."""
+    if inspect.isclass(function):
+        return inspect.getsource(function)
+    names, texts, known = [function.__name__], [], function.__globals__
+    for name in names:
+        texts.append(inspect.getsource(known[name]))
+        names += [other for other in known[name].__code__.co_names if other not in names
+                  and inspect.isfunction(known.get(other))
+                  and known[other].__module__ == function.__module__]
+    return ''.join(texts)
+
+
+def inputs(name: str) -> str:
+    """Digest of everything that decides a picture, except for most of the package itself."""
+    function, read = PICTURES.get(name, (None, ()))
+    drawn_by = (function,) if function else next(
+        drawn_by for pattern, (_, drawn_by) in OTHERS.items() if Path(name).match(pattern))
+    text = ''.join(map(sources, drawn_by))
+    colours = figures.LINES, PARTS, BEFORE, AFTER, INK, FAINT, STYLE
+    return digest(text, repr(colours), *([inspect.getsource(film)] if 'film.' in text else []),
+                  *(b''.join(re.findall(b'```.*?```', path.read_bytes(), re.S))
+                    if path.suffix == '.md' else path.read_bytes()     # the code of a page
+                    for pattern in read for path in sorted(ROOT.glob(pattern))))
+
+
+def commands() -> dict[str, str]:
+    """Every picture that has an entry -> the command that draws it."""
+    return {**{name: f'python docs/make_pictures.py {Path(name).stem}' for name in PICTURES},
+            **{path.relative_to(DOCS).as_posix(): command for pattern, (command, _) in
+               OTHERS.items() for path in sorted(DOCS.glob(pattern))}}
+
+
+def recorded() -> dict[str, str]:
+    """Digests of the inputs with which pictures were drawn."""
+    return json.loads(INPUTS.read_text(encoding='utf-8'))
+
+
+def stale() -> dict[str, str]:
+    """Pictures whose recorded digest is not that of their inputs, with their commands."""
+    known = recorded()
+    return {name: command for name, command in commands().items()
+            if known.get(name) != inputs(name)}
 
 
 def main(names):
-    """Draw the named pictures, all by default."""
-    FOLDER.mkdir(parents=True, exist_ok=True)
-    for name in names or PICTURES:
-        with matplotlib.rc_context(STYLE):
-            PICTURES[name]().savefig(FOLDER / f'{name}.png', dpi=DOTS,
-                                     pil_kwargs={'optimize': True})
-        print(FOLDER / f'{name}.png')
+    """Draw pictures whose name is given, or all stale ones; record the inputs of those drawn."""
+    for name, command in commands().items():
+        if Path(name).stem not in names and (names or name not in stale()):
+            continue
+        if name in PICTURES:
+            with matplotlib.rc_context({**STYLE, 'svg.fonttype': 'none', 'svg.hashsalt': name}):
+                made = PICTURES[name][0]()
+                if isinstance(made, Figure):
+                    made.savefig(DOCS / name, dpi=DOTS, **(
+                        {'metadata': {'Date': None}} if name.endswith('svg') else
+                        {'pil_kwargs': {'optimize': True}}))
+                else:
+                    film.write(DOCS / name, made)
+        elif not names:     # a name confirms that it was drawn
+            print(f'stale: {name}: {command}, then python docs/make_pictures.py {Path(name).stem}')
+            continue
+        INPUTS.write_text(json.dumps(recorded() | {name: inputs(name)}, indent=1) + '\n')
+        print(DOCS / name)
 
 
 if __name__ == '__main__':

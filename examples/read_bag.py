@@ -3,7 +3,7 @@ Read a recorded flight into numpy arrays.
 
     python examples/read_bag.py [BAG]           # without one, a short flight is recorded first
 
-Times are absolute, in seconds since 1970; t - log.start is the time since the start.
+Times are seconds since the first sample; log.epoch is that moment in seconds since 1970.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ import beetle_omni_ros
 def summary(bag):
     """Print the contents of a bag, and errors of the position."""
     log = beetle_omni_ros.read_run(bag)
-    print(f'{log.end - log.start:.1f} s, task {log.meta.get("task")}, '
+    print(f'{log.end:.1f} s, task {log.meta.get("task")}, '
           f'{len(log.imu.t)} IMU samples, {len(log.mocap.t)} poses, {len(log.targets)} targets')
     print('highest speed', f'{np.linalg.norm(log.odom.velocity, axis=1).max():.2f} m/s,',
           'largest tilt', f'{np.abs(log.joint.position).max():.2f} rad,',
@@ -29,7 +29,7 @@ def summary(bag):
              in zip(latest, log.odom.t, log.odom.position, strict=True) if k >= 0]
     if error:
         print(f'distance to the target: {1000 * np.median(error):.1f} mm median, '
-              f'{1000 * error[-1]:.1f} mm at {log.odom.t[-1] - log.start:.1f} s')
+              f'{1000 * error[-1]:.1f} mm at {log.odom.t[-1]:.1f} s')
     if len(log.truth.t):                        # of simulated flights only
         truth = np.column_stack([np.interp(log.odom.t, log.truth.t, axis)
                                  for axis in log.truth.position.T])

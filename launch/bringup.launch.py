@@ -39,8 +39,6 @@ ARGUMENTS = {
                               'arguments set'),
     'task': ('', None, 'task for reference_node; empty: targets come from elsewhere'),
     'record': ('', None, 'folder for a bag; empty: no recording'),
-    'allow_other_robot': ('false', ['true', 'false'],
-                          'fly a policy that was trained for other robot parameters'),
     'namespace': ('', None, 'namespace of every node and topic'),
     'viewer': ('false', ['true', 'false'], 'description and tf for RViz and Foxglove'),
     'robot_file': ('', None, 'robot file that estimator and controller believe'),
@@ -73,7 +71,7 @@ def actions(context):
     nodes, left_out = graph.plan(
         simulated=given['backend'] == 'sim', ports=folder, bag=given['record'],
         seed=int(given['seed']),
-        **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
+        **{key: given[key] == 'true' for key in ('standby', 'viewer')},
         **{key: given[key] for key in ('actuators', 'clock', 'conditions', 'controller',
                                        'plant_file', 'policy', 'robot_file', 'task')})
     for name, reason in left_out.items():

@@ -80,7 +80,7 @@ CASES = {
         ('hover --nmpc horizon.yaml', '--nmpc horizon.yaml'),
         ('hover --policy policy.onnx', '--policy policy.onnx')],
     EVALUATE: [
-        ('--plant unknown.yaml', 'masss'),
+        ('--controller npmc', "'npmc': expected one of nmpc"), ('--plant unknown.yaml', 'masss'),
         ('--conditions windy', "--conditions 'windy': expected nominal or"),
         ('--sed 1', '--sed'), ('--seed', '--seed'), ('extra', 'extra'),
         ('--bag folder', 'folder: exists already; a bag needs a new folder'),
@@ -88,10 +88,11 @@ CASES = {
     FLY: [
         ('--task text.csv', 'row 3'), ('--robot unknown.yaml', 'masss'),
         ('--controller npmc', "controller 'npmc': expected one of nmpc"),
+        ('--controllers npmc', "controller 'npmc': expected one of nmpc"),
         ('--faults process.yaml', 'expected a fault of the robot'),
         ('--faults device.yaml --actuators emulated', 'expected --actuators direct'),
         ('--actuators steam', "actuators 'steam': expected emulated or direct"),
-        ('--clock sun', "clock 'sun': expected system or simulated"),
+        ('--clock sun', "clock 'sun': expected auto or system or simulated"),
         ('--domain-id 102', "'--domain-id': Input"),
         ('--clock simulated --actuators emulated', 'serial devices keep real')],
     COMPARE: [
@@ -117,7 +118,8 @@ CASES = {
         ('imu_only --output no/page.html', 'page.html')],
     'view': [
         ('none', 'none: no such bag'),
-        ('imu_only --namespace a', '--namespace: expected without')],
+        ('imu_only --namespace a', '--namespace: expected without'),
+        ('--rerun', '--rerun: expected RUN')],
     'gap': [
         ('', "'RUN...'"), ('none', 'none: no such bag'), ('imu_only imu_only', 'imu_only'),
         ('imu_only --robot unknown.yaml', 'masss'), ('imu_only --gap unknown.yaml', 'masss'),

@@ -95,6 +95,8 @@ def test_report_writes_one_page_that_needs_no_network_also_of_a_truncated_bag(ca
     assert sum(pose['reached'] for pose in judged['flight']['poses']) == 3
     assert 0 < sum(pose['reached'] for pose in judged['cut']['poses']) < 3
     assert '3 of 15' in printed.out and 'cut off' in printed.err
+    assert printed.out.endswith(f'files: {page}\nfiles: {result}\nnext:  open {page} in a '
+                                f'browser\nnext:  beetle_omni view {bag} {cut}\n')
 
 
 @pytest.mark.parametrize(('command', 'folder', 'module', 'remedy'), [

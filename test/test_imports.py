@@ -29,8 +29,9 @@ ALLOWED = {
     'start': (),
     'options': ('model', 'control'),
     'identify_commands': ('options', 'model', 'bags', 'identify'),
-    'commands': ('options', 'identify_commands', 'model', 'control', 'drivers', 'bags', 'show',
-                 'flight', 'identify', 'train', 'ros'),
+    'improve': ('options', 'model', 'show', 'flight', 'identify'),
+    'commands': ('options', 'identify_commands', 'improve', 'model', 'control', 'drivers',
+                 'bags', 'show', 'flight', 'identify', 'train', 'ros'),
     'cli': ('model', 'commands', 'options'),
     '__main__': ('cli',),
 }
@@ -39,7 +40,7 @@ ALLOWED = {
 KEPT_IN = {'mujoco': 'sim', 'rclpy': 'ros', 'launch': 'ros', 'torch': 'train',
            'rsl_rl': 'train', 'tensordict': 'train', 'dynamixel_sdk': 'drivers',
            'pymavlink': 'drivers', 'serial': 'drivers', 'gymnasium': 'flight', 'viser': 'show',
-           'trimesh': 'show'}
+           'trimesh': 'show', 'pandas': 'show'}
 
 
 def imports(path):

@@ -21,7 +21,7 @@ HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 # Import name -> distribution on PyPI, where they differ; import name -> rosdep key.
 DISTRIBUTION = {'yaml': 'pyyaml', 'serial': 'pyserial', 'dynamixel_sdk': 'dynamixel-sdk',
-                'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow'}
+                'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow', 'rerun': 'rerun-sdk'}
 KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'casadi': 'casadi-pip',
        'serial': 'python3-serial', 'PIL': 'python3-pil'}
 
@@ -64,6 +64,7 @@ def dependencies(*tags):
 def test_name_version_and_licence_agree_everywhere(setup_arguments):
     assert MANIFEST.find('name').text == setup_arguments['name'] == PACKAGE
     assert MANIFEST.find('version').text == beetle_omni_ros.__version__
+    assert f'\nversion: {beetle_omni_ros.__version__}\n' in (ROOT / 'CITATION.cff').read_text()
     assert setup_arguments['version'] == beetle_omni_ros.__version__
     assert MANIFEST.find('license').text == setup_arguments['license'] == 'BSD-3-Clause'
     assert (ROOT / MANIFEST.find('license').get('file')).is_file()
@@ -104,7 +105,8 @@ def test_data_files_are_in_the_folders_of_ros(setup_arguments):
 def test_every_import_is_a_declared_requirement(setup_arguments):
     extras = setup_arguments['extras_require']
     lines = [*setup_arguments['install_requires'],
-             *(line for extra in ('hardware', 'train', 'gym') for line in extras[extra])]
+             *(line for extra in ('hardware', 'train', 'gym', 'notebook', 'rerun')
+               for line in extras[extra])]
     declared = {re.split(r'[\[<>=~;! ]', line)[0] for line in lines}
     keys = dependencies('exec_depend', 'depend')
     without_key = re.search('No key exists for (.*?):', (ROOT / 'package.xml').read_text(),
@@ -114,7 +116,7 @@ def test_every_import_is_a_declared_requirement(setup_arguments):
             assert module in keys, f'{module}: not in package.xml'
             continue
         assert DISTRIBUTION.get(module, module) in declared, f'{module}: not in setup.py'
-        if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'gymnasium'):
+        if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'gymnasium', 'pandas', 'rerun'):
             candidates = {KEY.get(module), f'python3-{module}', f'python3-{module}-pip', module}
             assert keys & candidates or module in without_key, f'{module}: no rosdep key'
 

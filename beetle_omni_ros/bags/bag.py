@@ -19,7 +19,7 @@ from mcap.stream_reader import get_chunk_data_stream, read_magic
 import numpy as np
 
 from beetle_omni_ros.bags.conversions import from_nanoseconds
-from beetle_omni_ros.bags.log import channels_of, FlightLog, LogRecorder, META_KEY, motion
+from beetle_omni_ros.bags.log import channels_of, FlightLog, LogRecorder, META_KEY
 from beetle_omni_ros.bags.messages import columns, from_bytes
 from beetle_omni_ros.bags.topics import ALL, controller_of, TELLING, Topic, topic_of
 from beetle_omni_ros.control.base import TrajectoryTarget
@@ -303,23 +303,11 @@ def _problems(counts, unused):
 
 
 def read_flights(paths: Iterable[str | Path], most: int) -> dict[str, FlightLog]:
-    """
-    Read the flights of RUN arguments: name -> flight with poses.
-
-    Raises:
-        ParameterError: as of :func:`read_bag`, a bag without a pose, or more than ``most`` runs.
-
-    """
+    """Read the flights of RUN arguments by name; ParameterError: also above ``most`` runs."""
     runs = runs_in(paths)
     if len(runs) > most:
         raise ParameterError(f'{len(runs)} runs; expected at most {most}')
-    logs = {}
-    for path, name in zip(runs, names_of(runs), strict=True):
-        log = logs[name] = read_bag(path)
-        if not len(motion(log).t):
-            raise ParameterError('; '.join([f'{path}: no pose of the robot; expected '
-                                            'ground_truth/odom or odom', *log.warnings]))
-    return logs
+    return {name: read_bag(path) for path, name in zip(runs, names_of(runs), strict=True)}
 
 
 def _stamped(value, received):
@@ -328,9 +316,8 @@ def _stamped(value, received):
         return [entry if entry.t else replace(entry, t=received) for entry in value]
     if getattr(value, 'stamp', True):   # a text has none, neither has the health of the actuators
         return value
-    if isinstance(value, TrajectoryTarget):
-        return replace(value, stamp=received, times=value.times + received)
-    return replace(value, stamp=received)
+    return value.delayed(received) if isinstance(value, TrajectoryTarget) \
+        else replace(value, stamp=received)
 
 
 def _metadata(path, warnings):

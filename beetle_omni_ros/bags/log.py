@@ -348,6 +348,20 @@ def errors(body: Series, target: Target, window: slice = slice(None)):
             np.degrees(geodesic_angles(body.quaternion[window], quaternion)))
 
 
+def spans(log: FlightLog) -> list[tuple[Target, float]]:
+    """Return (target, its end [s]) of each target."""
+    return list(zip(log.targets, [*(target.stamp for target in log.targets[1:]), log.end]))
+
+
+def target_errors(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (n,) times [s] and the errors (n,) [m], (n,) [deg] from the newest target."""
+    body, parts = motion(log), [np.zeros((3, 0))]
+    for target, end in spans(log):
+        window = body.window(target.stamp, end - 1e-3)
+        parts.append(np.array([body.t[window], *errors(body, target, window)]))
+    return tuple(np.concatenate(parts, axis=1))
+
+
 def estimate_errors(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Compute the errors of the estimate from the truth, where their stamps agree within 2.5 ms.

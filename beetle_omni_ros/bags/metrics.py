@@ -139,7 +139,7 @@ def _controller_metrics(log, task, name, poses, intervals, *, is_alone):
     for missing in task.poses[len(flown):] if whole else ():
         flown.append({'target': [float(v) for v in missing], **dict.fromkeys(POSE_KEYS),
                       'reached': False})
-    result: dict = {'poses': flown}
+    result: dict = {'controller': name, 'poses': flown}
     for word, reduce in (('mean', np.mean), ('median', np.median), ('max', np.max),
                          ('min', np.min)):
         result[word] = {key: reduced(reduce, [pose[key] for pose in flown]) for key in POSE_KEYS}
@@ -149,6 +149,8 @@ def _controller_metrics(log, task, name, poses, intervals, *, is_alone):
         result['landing'] = landing
     if ending:
         result['ended'] = ending
+    result['alarms'] = {fault: t - log.begin for fault, t in log.named_faults().items()
+                        if is_alone or inside(np.array([t]), intervals)[0]}
     if log.meta.get('controller_error'):
         result['controller_error'] = log.meta['controller_error']
     reports = [entry.values['guidance'] for entry in log.diagnostics

@@ -97,6 +97,10 @@ class PoseTarget(Reference):
     angular_velocity: np.ndarray = field(init=False, default_factory=lambda: AT_REST)
     stamp: float = 0.0
 
+    def delayed(self, time: float) -> PoseTarget:
+        """Return the target with its time moved by ``time`` [s]."""
+        return replace(self, stamp=self.stamp + time)
+
     def same_pose(self, other: PoseTarget) -> bool:
         """Whether another target is the same pose."""
         return self.position.tolist() == other.position.tolist() \
@@ -124,6 +128,10 @@ class TrajectoryTarget:
     velocities: np.ndarray
     angular_velocities: np.ndarray
     stamp: float = 0.0
+
+    def delayed(self, time: float) -> TrajectoryTarget:
+        """Return the target with its times moved by ``time`` [s]."""
+        return replace(self, stamp=self.stamp + time, times=self.times + time)
 
     def at(self, time: float) -> Reference:
         """The reference at ``time``: faster than :meth:`sample` of one time."""

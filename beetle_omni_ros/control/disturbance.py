@@ -102,7 +102,7 @@ class DisturbanceEstimator:
 
     def update(self, state: State) -> np.ndarray:
         """Observe, and predict the state (25,) at which a command for ``state`` acts."""
-        return self._flown(self.observe(state), state.stamp, self.delay)
+        return self.flown(self.observe(state), state.stamp, self.delay)
 
     def observe(self, state: State) -> np.ndarray:
         """Update with one state estimate; returns the (25,) full state at its stamp."""
@@ -120,7 +120,7 @@ class DisturbanceEstimator:
             actuators = np.concatenate([state.tilt, state.tilt_velocity, thrust])
             self._tilts.clear()
         else:
-            predicted = self._flown(self._state, self._stamp, step)
+            predicted = self.flown(self._state, self._stamp, step)
             self._learn(state, predicted)
             actuators = predicted[13:]
         present = np.concatenate([state.position, state.velocity, state.quaternion,
@@ -139,8 +139,8 @@ class DisturbanceEstimator:
                                        self._direction)
         return tilt + self._band * self._direction
 
-    def _flown(self, state, start, duration):
-        """(25,) state after a time span, in which commands may change."""
+    def flown(self, state: np.ndarray, start: float, duration: float) -> np.ndarray:
+        """(25,) state after a time span [s], in which commands may change."""
         end = start + duration
         changes = [end]
         for command in reversed(self._commands):    # newest first

@@ -27,8 +27,8 @@ class PolicyParameters(ParameterFile, file='rl.yaml'):
     """Policy file and guidance."""
 
     policy: str = parameter(DEFAULT, doc="ONNX file, in the package's share or any path")
-    allow_other_robot: bool = parameter(
-        False, doc='fly a policy that was trained for other robot parameters')
+    matching: bool = parameter(
+        True, doc='fly another robot than that of the training by model matching')
     reach: float = parameter(6.5, doc='a target farther from the robot is refused', unit='m',
                              low=0.5, high=1000)
     without: str = parameter('', doc="layers of the guidance that are off: names with commas, or "
@@ -47,8 +47,13 @@ class PolicyController:
 
     def __init__(self, robot: RobotParameters, parameters: PolicyParameters | None = None):
         p = parameters or PolicyParameters.load()
-        self.network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
+        self.network = PolicyNetwork(p.policy, robot)
         self.contract = contract = self.network.contract
+        trained = contract.trained_robot(robot)
+        self._matching = None
+        if p.matching and trained is not robot:
+            from beetle_omni_ros.control.matching import ModelMatching
+            self._matching = ModelMatching(trained, robot, COMMAND_DELAY, LATEST)
         self.name, self.period, self.reach = contract.name, 1 / contract.rate_hz, p.reach
         self._scale, self._offset = contract.action_scale, contract.action_offset
         tilt, rotors = robot.joints.position_limit, robot.rotors
@@ -59,9 +64,8 @@ class PolicyController:
             from beetle_omni_ros.control import disturbance
             from beetle_omni_ros.model.dynamics import integrator
             # The disturbance of another robot is its difference from that of the training.
-            known = contract.trained_robot(robot)
             self._estimator = disturbance.DisturbanceEstimator(
-                known, disturbance.DisturbanceParameters(), COMMAND_DELAY, integrator(known))
+                trained, disturbance.DisturbanceParameters(), COMMAND_DELAY, integrator(trained))
         self._guidance = Guidance(robot.tilt_axes, p.without)
         self.guidance = self._guidance.text
         self.reset()
@@ -75,6 +79,8 @@ class PolicyController:
         self._latest: deque[list[float]] = deque(maxlen=LATEST)
         if self._estimator:
             self._estimator.reset()
+        if self._matching:
+            self._matching.reset()
 
     def step(self, state: State, target: Target) -> Command:
         """One command for one state."""
@@ -82,6 +88,8 @@ class PolicyController:
         if state.stamp - self._stamp > LONGEST_STEP:
             self.network.reset()
         self._stamp = state.stamp
+        if self._matching:
+            state = self._matching.observed(state)
         command = state.command
         executed = command and command.tilt.tolist() + command.thrust.tolist()
         if isinstance(target, PoseTarget):      # in charge: the executed command is a latest one
@@ -101,7 +109,8 @@ class PolicyController:
             else:
                 self._faults += 1
         self._latest.append(values)
-        return Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
+        own = Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
+        return self._matching.sent(own) if self._matching else own
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Counts since reset, and the disturbance estimates of a policy with memory."""

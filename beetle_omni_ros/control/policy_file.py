@@ -142,32 +142,30 @@ class PolicyContract:
         return replace(robot, **parts, effects=values['effects'], **_arrays(
             {name: values[name] for name in ('mass', 'gravity', 'inertia')}))
 
-    def check(self, robot: RobotParameters, allow_other_robot: bool = False) -> str:
+    def check(self, robot: RobotParameters) -> str:
         """
         Compare with this version for ``robot``; ParameterError names the first difference.
 
         Returns:
-            A warning, one line, when another robot was allowed; else ''.
+            The differences from the robot of the training, one line; '' without any.
 
         """
-        expected, warning = PolicyContract.default(robot, self.memory), ''
+        expected, other = PolicyContract.default(robot, self.memory), ''
         if self.robot_hash != expected.robot_hash:
             found = list(_differences(expected.robot_values, trained_for(self.robot_values))) or [
                 f'robot_hash {self.robot_hash} in training, {expected.robot_hash} here']
-            warning = f"trained for other robot parameters: {shortened('; '.join(found), LONGEST)}"
+            other = f"trained for other robot parameters: {shortened('; '.join(found), LONGEST)}"
         for key in ('observations', 'actions', 'action_scale', 'rate_hz',
-                    *([] if warning else ['action_offset'])):
+                    *([] if other else ['action_offset'])):
             ours, theirs = getattr(expected, key), getattr(self, key)
             if isinstance(ours, list) and isinstance(theirs, list):     # the first that differs
                 ours, theirs = next((pair for pair in zip_longest(ours, theirs)
                                      if pair[0] != pair[1]), (None, None))
             if ours != theirs:
                 raise ParameterError(f'{key}: expected {ours}, found {theirs}')
-        if warning and not allow_other_robot:
-            raise ParameterError(f'{warning}; train a policy for this robot, or fly this policy '
-                                 'with --allow-other-robot (evaluate and fly; '
-                                 'allow_other_robot:=true of launch file and nodes)')
-        return warning
+        if other:
+            self.trained_robot(robot)
+        return other
 
 
 def trained_for(robot: RobotParameters | dict) -> dict:
@@ -262,11 +260,10 @@ class PolicyNetwork:
 
     """
 
-    def __init__(self, path: str | Path, robot: RobotParameters,
-                 allow_other_robot: bool = False):
+    def __init__(self, path: str | Path, robot: RobotParameters):
         path = find(path)
         try:
-            warning = self._open(path.read_bytes(), robot, allow_other_robot)
+            other = self._open(path.read_bytes(), robot)
         except ParameterError as error:
             raise ParameterError(f'policy {path}: {shortened(str(error), 2 * LONGEST)}') from None
         except Exception as error:      # onnxruntime's exceptions have no common base class
@@ -274,8 +271,8 @@ class PolicyNetwork:
             reason = str(error).strip().partition('\n')[0].split(' : ')[-1]
             raise ParameterError(f'policy {path}: not a usable ONNX file '
                                  f'({shortened(reason)})') from None
-        if warning:
-            log.warning('policy %s: %s', path, warning)
+        if other:
+            log.info('policy %s: %s', path, other)
 
     def __call__(self, observation: list[float]) -> list[float]:
         """Action (8) for an observation (n), both in plain numbers."""
@@ -290,12 +287,12 @@ class PolicyNetwork:
         if self._history is not None:
             self._history[:] = 0.0
 
-    def _open(self, data, robot, allow_other_robot):
+    def _open(self, data, robot):
         """Check contract and tensors, let the session use two arrays at every call, warm up."""
         verify(data)
         network = self._session = session(data)
         self.contract = PolicyContract.from_metadata(network.get_modelmeta().custom_metadata_map)
-        warning = self.contract.check(robot, allow_other_robot)
+        other = self.contract.check(robot)
         size = self.contract.observation_size
         self._input = np.zeros((1, size), np.float32)
         self._output = np.zeros((1, len(self.contract.actions)), np.float32)
@@ -320,7 +317,7 @@ class PolicyNetwork:
         self.reset()
         if not all(map(isfinite, action)):
             raise ParameterError('the action for an observation of 0.1 is not finite')
-        return warning
+        return other
 
 
 def find(path: str | Path) -> Path:

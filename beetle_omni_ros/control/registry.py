@@ -40,7 +40,6 @@ class ControllerOptions:
 
     parameters: Path | None = None
     policy: Path | None = None
-    allow_other_robot: bool = False     # fly a policy trained for other robot parameters
     without: str = ''                   # layers of the guidance that are off
 
 
@@ -90,8 +89,7 @@ class ControllerEntry:
                 raise ParameterError(f"controller '{self.reference}': parameters_file '{file}': "
                                      'not found') from None
         parameters = schema.bind(kind, schema.load_yaml(file) if file else {}, str(file or ''))
-        given = {'policy': str(options.policy or ''), 'without': options.without,
-                 'allow_other_robot': options.allow_other_robot}
+        given = {'policy': str(options.policy or ''), 'without': options.without}
         return replace(parameters, **{key: value for key, value in given.items()
                                       if value and hasattr(parameters, key)})
 

@@ -34,6 +34,7 @@ VOLTAGE_TIME_CONSTANT = 0.05    # [s] of the voltage filter before the thrust ma
 PLAUSIBLE_CELL = 2.5, 4.4       # [V] voltage of a LiPo cell
 ACKNOWLEDGE_TIMEOUT = 0.1   # [s] until a command is repeated
 ATTEMPTS = 5            # of a command
+MARKER, HEADER, CHECKSUM = 0xFD, 10, 2      # first byte of a frame, sizes [B]
 RESULTS = {1: 'refused', 2: 'denied', 3: 'unsupported', 4: 'failed'}
 
 
@@ -83,30 +84,30 @@ class MavlinkReceiver:
     ``counts`` are messages received and bytes; lost: gaps in the sender's sequence numbers;
     bad_crc: frames with a valid header and a wrong checksum; skipped_bytes: outside valid frames;
     foreign: valid frames of another sender. A message for which ``restarts`` is true ends no gap.
+    After a bad frame the search continues one byte after its marker. Frames of MAVLink 1, with
+    incompat_flags, and of unknown messages, whose checksum cannot be tested, are skipped.
     """
 
     def __init__(self, system: int, component: int,
                  restarts: Callable[[object], bool] = lambda message: False):
         self._sender, self._restarts = (system, component), restarts
+        self._decoder = common.MAVLink(None)
         self.counts = dict.fromkeys(
             ('received', 'bytes', 'lost', 'bad_crc', 'skipped_bytes', 'foreign'), 0)
         self.restart()
 
     def restart(self) -> None:
         """Forget an incomplete frame and the sequence number."""
-        self._parser = common.MAVLink(None)
-        self._parser.robust_parsing = True
+        self._held = bytearray()
         self._sequence: int | None = None
 
     def feed(self, data: bytes) -> list:
         """Parse further bytes; return the messages that they complete."""
         counts, found = self.counts, []
         counts['bytes'] += len(data)
-        for message in self._parser.parse_buffer(data) or ():
-            if message.get_msgId() < 0:     # bad data, or an unknown message, which has no CRC
-                counts['skipped_bytes'] += len(message.data)
-                counts['bad_crc'] += 'CRC' in getattr(message, 'reason', '')
-            elif (message.get_srcSystem(), message.get_srcComponent()) != self._sender:
+        self._held += data
+        while (message := self._next()) is not None:
+            if (message.get_srcSystem(), message.get_srcComponent()) != self._sender:
                 counts['foreign'] += 1
             else:
                 counts['received'] += 1
@@ -116,6 +117,29 @@ class MavlinkReceiver:
                 self._sequence = sequence
                 found.append(message)
         return found
+
+    def _next(self):
+        """Remove and return the first message; None if none is complete."""
+        held = self._held
+        while held:
+            header = held[:HEADER]
+            begun = header[0] == MARKER and not any(header[2:3]) and (
+                len(header) < HEADER or int.from_bytes(header[7:], 'little') in common.mavlink_map)
+            if begun:
+                end = HEADER + header[1] + CHECKSUM if len(header) == HEADER else math.inf
+                if len(held) < end:
+                    return None
+                try:
+                    message = self._decoder.decode(held[:end])
+                except common.MAVError:
+                    self.counts['bad_crc'] += 1
+                else:
+                    del held[:end]
+                    return message
+            skipped = held.find(MARKER, 1) % (len(held) + 1)    # all, if it finds none
+            self.counts['skipped_bytes'] += skipped
+            del held[:skipped]
+        return None
 
 
 class ClockOffset:

@@ -36,7 +36,7 @@ from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import commit
 from beetle_omni_ros.model.schema import ParameterError, RunError
-from beetle_omni_ros.show.page import print_grids, rendered, Terminal
+from beetle_omni_ros.show.page import print_end, print_grids, rendered, Terminal
 
 # --- flights -------------------------------------------------------------------------------------
 
@@ -306,4 +306,5 @@ def write(results: dict, flown: dict, output: Path, console: Console) -> None:
     if broken:
         console.print(f'{broken} of {len(flown)} flights failed, see above and on the page',
                       style='red', highlight=False)
-    console.print(f'{output / PAGE}', highlight=False)
+    print_end(console, [output / name for name in (PAGE, TEXT, NUMBERS)],
+              f'open {output / PAGE} in a browser; the same command flies only what is missing')

@@ -52,7 +52,7 @@ def convergence(groups: Groups, task: str) -> Figure:
     """Errors in the 8 s of a pose: median and 10 to 90 % band over all poses."""
     figure, axes = panels(1, 2, height=2.8)
     grid = np.arange(0.0, POSE_DURATION, STEP)
-    for name, results in groups.items():
+    for k, (name, results) in enumerate(groups.items()):     # the first is on top
         style = look(name)
         for panel, (what, floor) in zip(axes[0], FLOOR.items(), strict=True):
             folded = _folded(results, f'{what}_error', grid)
@@ -61,7 +61,7 @@ def convergence(groups: Groups, task: str) -> Figure:
             low, middle, high = np.maximum(np.percentile(folded, (10, 50, 90), axis=0), floor)
             panel.fill_between(grid, low, high, color=style.colour, alpha=0.13, lw=0)
             panel.plot(grid, middle, color=style.colour, ls=style.dashes, lw=1.7,
-                       label=style.label)
+                       label=style.label, zorder=3 - k / len(groups))
     for panel, what in zip(axes[0], FLOOR, strict=True):
         for window, colour, name in ((L_WINDOW, '#eef1f5', 'L'), (U_WINDOW, '#d5e6d9', 'U')):
             panel.axvspan(*window, color=colour, lw=0, zorder=0)
@@ -95,8 +95,8 @@ def in_time(groups: Groups, task: str) -> Figure:
     for panel, what in zip(axes[:, 0], SHOWN, strict=True):
         if flown.kind in LEVELS:
             _levels(panel, flown)
-        highest = max(_error_curve(panel, results[0], what, name)
-                      for name, results in groups.items())
+        highest = max(_error_curve(panel, results[0], what, name, 3 - k / len(groups))
+                      for k, (name, results) in enumerate(groups.items()))
         panel.set_ylim(0, min(1.08 * highest, SHOWN[what]) or 1)
         panel.set_ylabel(f'{what} error [{UNITS[what]}]')
     axes[1, 0].set_xlim(POSE_DURATION - BEFORE, flown.duration)
@@ -120,11 +120,12 @@ def _levels(panel, task):
     panel.patch.set_visible(False)
 
 
-def _error_curve(panel, result, what, name):
+def _error_curve(panel, result, what, name, height):
     """Plot one flight's errors, mark lost control, and return the largest error."""
     style, trace = look(name), result['trace']
     t, values = trace['t'], trace[f'{what}_error']
-    panel.plot(t, values, color=style.colour, ls=style.dashes, lw=1.5, label=style.label)
+    panel.plot(t, values, color=style.colour, ls=style.dashes, lw=1.5, label=style.label,
+               zorder=height)
     if any(result['metrics'].get(kind, {}).get(f'lost_at_{unit}') is not None
            for kind, unit in (('force', 'N'), ('torque', 'N_m'))):
         last = np.flatnonzero(np.isfinite(values))[-1:]
@@ -180,7 +181,7 @@ NOTES = {
     'lemniscate_large': 'As the lemniscate, with 2.5 rad of roll and pitch.',
     'lemniscate': 'Ours is simulated, the published columns are measured on the real robot. The '
                   "curve is that of the authors' code. A value is the mean of a flight.",
-    **{name: RISING_LEVELS.format(kind, 'xyz'[int(np.flatnonzero(direction)[0]) % 3],
+    **{name: RISING_LEVELS.format(kind.capitalize(), 'xyz'[int(np.flatnonzero(direction)[0]) % 3],
                                  *times)
        for name, (kind, direction, _, *times) in RISING.items()},
     'wind': 'Errors from 2 s to 10 s at 4 m/s. The published columns are of the real robot.',
@@ -227,8 +228,8 @@ def interval(entry: dict, digits: int) -> str:
         f"{text} [{number(entry['low'], digits)}, {number(entry['high'], digits)}]"
 
 
-def table(results: dict, task: str, conditions: str) -> Grid:
-    """Every metric of a task: mean with interval, differences to the best, and the range."""
+def table(results: dict, task: str, conditions: str, brief: bool = False) -> Grid:
+    """Every metric of a task: mean with interval, unless brief also differences and ranges."""
     numbers = results['summary']['tasks'][task][conditions]
     ours = [name for name in results['meta']['controllers'] if name in numbers['flights']]
     kind = kind_of(task)
@@ -245,13 +246,13 @@ def table(results: dict, task: str, conditions: str) -> Grid:
             *(number(entry.get('mean'), None)
               + (f" ± {number(entry['std'], None)}" if entry.get('std') else '')
               for entry in given)])
-        if len(ours) > 1:
+        if len(ours) > 1 and not brief:
             rows.append(['difference to the best', *(
                 ABSENT if of[name]['difference'] is None
                 else interval(of[name]['difference'], metric.digits) for name in ours),
                 *(ABSENT for _ in paper)])
         if kind in ('random', 'poses') and most > len(numbers['flights'][ours[0]]['seeds']) \
-                and not metric.more:
+                and not metric.more and not brief:
             rows.append(['least to largest', *(
                 f"{number(entry.get('min'), digits)} to {number(entry.get('max'), digits)}"
                 if entry.get('min') is not None else ABSENT for entry, digits in (
@@ -270,8 +271,8 @@ def table(results: dict, task: str, conditions: str) -> Grid:
          *(f'{look(name).label} (published, {real})' for name in paper)],
         rows, best=frozenset(best), faint_columns=frozenset(range(len(ours) + 1, len(rows[0]))),
         note=' '.join([f"Seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}.",
-                       NOTES['intervals'].format(' and pose' * (kind in ('random', 'poses'))),
-                       NOTES[kind]]))
+                       *([] if brief else [NOTES['intervals'].format(
+                           ' and pose' * (kind in ('random', 'poses')))]), NOTES[kind]]))
 
 
 def glance(results: dict) -> Grid:
@@ -339,7 +340,7 @@ def png(figure: Figure) -> bytes:
 
 
 def content(results: dict, made: list[Section]) -> dict:
-    """What both forms of the page show: terms with their meaning, facts, sections, flights."""
+    """What the pages show: sections, brief tables by title, terms, facts, flights."""
     meta = results['meta']
     terms = []
     for name in meta['controllers']:
@@ -361,5 +362,7 @@ def content(results: dict, made: list[Section]) -> dict:
          flight['failure'] or flight['metrics'].get('ended')
          or ('touched the ground' if flight['metrics']['crashed'] else 'flown'),
          number(flight['cpu_s'], 1)] for flight in results['flights']])
+    brief = [table(results, task, conditions, brief=True)
+             for task, shown in results['summary']['tasks'].items() for conditions in shown]
     return {'title': TITLE, 'terms': terms, 'facts': facts, 'sections': made, 'flights': flights,
-            'command': meta['command']}
+            'brief': {grid.title: grid for grid in brief}, 'command': meta['command']}

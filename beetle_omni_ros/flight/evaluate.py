@@ -1,7 +1,7 @@
 """`beetle_omni evaluate`: flies tasks in one process with one or several controllers."""
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, ExitStack
+from contextlib import closing, contextmanager, ExitStack
 from pathlib import Path
 import signal
 import threading
@@ -25,6 +25,7 @@ from beetle_omni_ros.flight.loop import FlightLoop
 from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.show import table
+from beetle_omni_ros.show.page import print_end
 from beetle_omni_ros.sim.faults import Fault, load_faults
 
 
@@ -87,10 +88,30 @@ def fly(controller: str, task: Task, *, robot: RobotParameters,
     built = built or entry.make(robot, options.get(entry.reference, ControllerOptions()))
     if task.kind == 'poses':
         check_steps(task.poses, reach_of(built), lambda k: f"task '{task.name}': pose {k + 1}")
-    with closing(prepared(controller, robot=robot, options=options, built=built,
-                          pilot=bool(faults), faults=faults, **given)) as loop:
-        loop.fly(task, progress)
+    with interruptible() as interrupts, closing(prepared(
+            controller, robot=robot, options=options, built=built, pilot=bool(faults),
+            faults=faults, **given)) as loop:
+        loop.fly(task, progress or (lambda completed: interrupts))
+        if interrupts:
+            raise KeyboardInterrupt
         return loop.recording()
+
+
+@contextmanager
+def interruptible():
+    """Yield a list that Ctrl-C fills, so that no record is cut; the second one interrupts."""
+    interrupts: list[int] = []
+
+    def interrupt(number, _):
+        if interrupts:
+            raise KeyboardInterrupt
+        interrupts.append(number)
+
+    with ExitStack() as stack:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler \
+                and threading.current_thread() is threading.main_thread():
+            stack.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, interrupt))
+        yield interrupts
 
 
 def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 'nominal',
@@ -98,7 +119,8 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
                  bag: Path | None = None, json_path: Path | None = None,
                  options: Mapping[str, ControllerOptions] = MappingProxyType({}),
                  faults: Path | None = None, actuators: str = 'direct',
-                 components: Sequence[str] = (), console: Console | None = None) -> dict:
+                 components: Sequence[str] = (), full: bool = False,
+                 console: Console | None = None) -> dict:
     """
     Fly a task with each controller and report; arguments as of `beetle_omni evaluate`.
 
@@ -128,18 +150,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
     if injected:
         meta['faults'] = [str(fault) for fault in injected]
     results: dict = {'meta': meta}
-    interrupts: list[int] = []
-
-    def interrupt(number, _):
-        """End the flight after a tick, so that no record is cut; the second time at once."""
-        if interrupts:
-            raise KeyboardInterrupt
-        interrupts.append(number)
-
-    with Progress(console=console, transient=True) as bars, ExitStack() as stack:
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler \
-                and threading.current_thread() is threading.main_thread():
-            stack.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, interrupt))
+    with Progress(console=console, transient=True) as bars, interruptible() as interrupts:
         for entry, controller in built.items():
             name = entry.name
             bar = bars.add_task(f'{name}: {task.name}, {conditions}', total=1.0)
@@ -155,9 +166,13 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             if interrupts:
                 meta['interrupted'] = True
                 break
-    table.print_results(results, console)
+    table.print_results(results, console, full=full)
     write_json(json_path, results)
     if interrupts:
-        console.print(f"interrupted; kept {bag or 'the results above'}", soft_wrap=True)
+        console.print(f"interrupted; kept {'what was flown' if bag else 'the table above'}")
+    bags = [bag / name if len(built) > 1 else bag for name in results if bag and name != 'meta']
+    print_end(console, [*bags, json_path],
+              *([('report', *bags), ('view', *bags)] if bags else ()))
+    if interrupts:
         raise KeyboardInterrupt
     return results

@@ -29,6 +29,7 @@ from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import commit
 from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.show.figures import AMBER, GREEN, RED
 from beetle_omni_ros.show.page import (
     ABSENT,
     Grid,
@@ -36,6 +37,7 @@ from beetle_omni_ros.show.page import (
     markdown,
     number,
     page,
+    print_end,
     print_grids,
     section,
     verdict_head,
@@ -47,7 +49,7 @@ from beetle_omni_ros.sim.faults import Case, chosen, load_cases
 NOTE = ('good: flights with the expected outcome or a better one. impact: speed of base_link at '
         'the fastest touchdown of a flight. named: median time until the supervisor detected a '
         'fault.')
-FAULT, PARTLY, SUCCESS = '#b3261e', '#d98a1c', '#2f8f5b'
+FAULT, PARTLY, SUCCESS = RED, AMBER, GREEN
 SOFTLY = f'{PLAN.impact_speed:g} m/s and {np.degrees(PLAN.inclination):.0f} deg'
 # Outcome -> meaning, the best outcome first.
 OUTCOMES = {
@@ -227,7 +229,7 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
         write_text(output / PAGE, as_page(results, output), 'page')
         write_text(output / 'faults.md', as_markdown(results), 'page')
     print_grids([grid(results, narrow=True)], console)
-    for text in (total_text(results), f'page: {output / PAGE}' if output
-                 else 'no page written; --output DIR writes one'):
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
+    console.print(total_text(results), highlight=False, markup=False, soft_wrap=True)
+    print_end(console, [output and output / PAGE, json_path], f'open {output / PAGE} in a browser'
+              if output else 'the same with --output DIR writes a page')
     return results

@@ -336,7 +336,7 @@ class FlightLoop(Loop):
     def aim(self, target: Target) -> None:
         """Publish a target; a pose is valid from now on if its stamp is 0."""
         self.publish('target_pose' if isinstance(target, PoseTarget) else 'target_trajectory',
-                     target)
+                     target if target.stamp else target.delayed(self.now()))
         self.deliver()
 
     # Faults -----------------------------------------------------------------------------------

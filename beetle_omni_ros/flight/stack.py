@@ -10,7 +10,7 @@ import numpy as np
 
 from beetle_omni_ros.bags.messages import MessageError
 from beetle_omni_ros.bags.topics import TARGETS
-from beetle_omni_ros.control.base import Controller, ControllerHost, guidance_of, PoseTarget, State
+from beetle_omni_ros.control.base import Controller, ControllerHost, guidance_of, State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.targets import TargetChecks
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
@@ -110,8 +110,7 @@ class ControllerComponent(Component):
         self._check_target(target, published)
         now = self.host.now()
         if target.stamp == 0.0:     # `ros2 topic pub` sets no stamp: valid from now on
-            target = replace(target, stamp=now, **(
-                {} if isinstance(target, PoseTarget) else {'times': target.times + now}))
+            target = target.delayed(now)
         elif target.stamp > now:    # a clock that is ahead must not make it outlast later targets
             target = replace(target, stamp=now)
         # Latched and volatile copies may overtake each other: the newest stamp counts, except

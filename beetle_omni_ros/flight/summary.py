@@ -11,7 +11,6 @@ from functools import cache
 from math import isfinite, sqrt
 from pathlib import Path
 from typing import Any
-from zlib import crc32
 
 import numpy as np
 from scipy.special import ndtr, stdtrit
@@ -20,7 +19,7 @@ from beetle_omni_ros.bags.metrics import at, CRASHED, failed, POSE_KEYS
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import PUSH_PERIOD, RISING, TILTS
 from beetle_omni_ros.show import table as published
-from beetle_omni_ros.show.figures import LINES
+from beetle_omni_ros.show.figures import line_of
 
 # --- statistics ----------------------------------------------------------------------------------
 
@@ -91,8 +90,6 @@ def compared(samples: Mapping[str, Sample], more: bool = False) -> dict[str, dic
 # --- metrics -------------------------------------------------------------------------------------
 
 PREFIX = 'published_'    # prefix of a controller in the publication
-# Colours of controllers outside the package, chosen by name.
-SPARE = ('#2a9d4b', '#7b4fb0', '#008c95', '#a0522d', '#6b7f1e')
 CONDITIONS = {
     'nominal': 'simulator as measured: multibody plant, second-order servos, rotor lag, sensor '
                'noise, every delay, state estimation by the EKF',
@@ -128,7 +125,7 @@ def look(controller: str) -> Look:
     """Look of a controller, or of its published counterpart."""
     name = controller.removeprefix(PREFIX)
     entry = registry.SHIPPED.get(name)
-    line = LINES.get(name, (SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1))))
+    line = line_of(name)
     if entry is None:
         return Look(name, '', *line)
     if name != controller:

@@ -19,7 +19,7 @@ from beetle_omni_ros.identify.servo import results as of_joints
 from beetle_omni_ros.identify.servo.log import read_joint_log
 from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.show.page import page, print_grids, Terminal
+from beetle_omni_ros.show.page import page, print_end, print_grids, Terminal
 
 TITLES = {'joint': 'Tilt servos', 'rotor': 'Rotor', 'robot': 'Robot'}
 
@@ -87,6 +87,8 @@ def run_identify(what: str, paths: Sequence[Path], *, validate: Sequence[Path] =
         about = f'identified for {params.name}' if params and whole else \
             f'identified from {", ".join(log.name for log in [*joints, *rotors])}'
         write_text(report, page(TITLES[what], about, tables, texts, sections), 'report')
+    print_end(console, [params, report, json_path], ('evaluate', '--plant', params)
+              if params else 'the same with --params FILE writes a robot file')
     return results
 
 

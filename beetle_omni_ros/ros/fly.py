@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, ExitStack
+from functools import partial
 from pathlib import Path
 import subprocess
 import sys
@@ -12,12 +13,13 @@ from rich.console import Console
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.bags.bag_writer import add_meta, check_new
+from beetle_omni_ros.bags.log import motion
 from beetle_omni_ros.bags.metrics import failed, metrics
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import make_task, Task
 from beetle_omni_ros.flight.component import ERROR
 from beetle_omni_ros.flight.loop import ARMING_TIME
-from beetle_omni_ros.model.files import write_json
+from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import find_robot, RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.ros import runner
@@ -30,33 +32,37 @@ from beetle_omni_ros.ros.graph import (
     reserved_domain,
 )
 from beetle_omni_ros.ros.operator import NEVER, Operator
+from beetle_omni_ros.ros.pace import too_slow
 from beetle_omni_ros.show import table
+from beetle_omni_ros.show.page import print_end
 from beetle_omni_ros.sim.faults import DEVICES, load_faults
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
 LANDING_TIMEOUT = 30.0  # s
 TICK = 0.005            # s between two attempts to arm in simulated time
+LOG = 'nodes.log'       # in the bag: what the nodes logged, in the order of time
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
 
 # s lost by the simulator above which a failure is attributed to the slow computer: the actuators
 # stop after so long without a command.
 SLOW_TIME = 0.1
 PACING = 'sim_node: pacing'
+FILM = 'flight.html'        # of --view, in the folder of the bag
 
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
-            bag: Path | None = None, seed: int = 0, conditions: str = 'nominal',
-            actuators: str | None = None, clock: str = 'system',
+            bag: Path, seed: int = 0, conditions: str = 'nominal',
+            actuators: str | None = None, clock: str = 'auto',
             robot: Path | None = None, plant: Path | None = None, nmpc: Path | None = None,
-            policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
+            policy: Path | None = None, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
             components: Sequence[str] = (), domain_id: int | None = None, view: bool = False,
-            console: Console | None = None) -> int:
+            full: bool = False, console: Console | None = None) -> int:
     """
     Fly a task through the ROS graph and print the results of the bag.
 
-    Arguments are the options of `beetle_omni fly`; without ``bag`` the bag is deleted.
+    Arguments are the options of `beetle_omni fly`.
 
     Returns:
         Exit status: 0 flown to the end, 1 not.
@@ -69,21 +75,23 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
     with ExitStack() as stack:
         stack.enter_context(runner.sigterm_as_interrupt())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
-        bag = Path(bag).absolute() if bag else folder / 'bag'
+        given, bag = Path(bag), Path(bag).absolute()
         check_new(bag)
         flown_task = make_task(task, seed, registry.find(controller).reach(
             RobotParameters.load(robot)))
         RobotParameters.load(plant or robot)
         injected = load_faults(faults) if faults else []
-        nodes, left_out = plan(
-            controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
-            standby=standby, allow_other_robot=allow_other_robot,
-            robot_file=_absolute(robot and find_robot(robot)),
+        planned = partial(
+            plan, controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
+            standby=standby, robot_file=_absolute(robot and find_robot(robot)),
             plant_file=_absolute(plant and find_robot(plant)),
             conditions=conditions, seed=int(seed),
             task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-            ports=str(folder), clock=clock, actuators=_checked(injected, actuators),
-            components=components)
+            ports=str(folder), actuators=_checked(injected, actuators), components=components)
+        nodes, left_out = planned(clock='system' if clock == 'auto' else clock)
+        if clock == 'auto':
+            clock = _clock(nodes, robot, actuators, console)
+            nodes, left_out = planned(clock=clock)
         nodes['sim_node']['task_faults'] = '; '.join(map(str, injected))
         if clock == 'simulated':    # it begins when all nodes are there
             nodes['sim_node']['pause_at'] = 0.0
@@ -107,18 +115,39 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             failure, slow = _fly(graph, controller, flown_task, console, clock == 'simulated')
         except KeyboardInterrupt:
             meta['interrupted'] = True
-        return _conclude(bag, flown_task, meta, failure, slow, json_path, console)
+        log = given / LOG if bag.is_dir() else given.with_name(f'{bag.name}.log')
+        write_text(log, ''.join(f'{line}\n' for line in graph.lines()), 'log')
+        try:
+            return _conclude(bag, flown_task, meta, failure, slow, json_path, console, full, view)
+        finally:
+            film = given / FILM
+            print_end(console, [given, log, *([film] if film.exists() else []), json_path],
+                      *([('report', given), ('view', given)] if bag.exists() else ()))
+
+
+def _clock(nodes, robot, actuators, console):
+    """Choose the clock of a flight by the pace of this computer, and say so in one line."""
+    with console.status('measuring the pace (the first time compiles the controller)'):
+        share, reason = too_slow(nodes, robot)
+    if not reason:
+        _print(console, f'real time: the flight needs {100 * share:.0f} % of a core')
+    elif actuators == 'emulated':
+        _print(console, f'{reason}; emulated devices have real time only', style='yellow')
+    else:
+        _print(console, f'{reason}; simulated time is used', style='yellow')
+        return 'simulated'
+    return 'system'
 
 
 def _conclude(bag: Path, task: Task, meta: dict, failure: str, slow: str,
-              json_path: Path | None, console: Console) -> int:
+              json_path: Path | None, console: Console, full: bool, film: bool) -> int:
     """Report the flight of a bag and why it failed; return the exit status."""
     if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
-        result = _report(bag, meta['controller'], task, meta, json_path, console)
+        result = _report(bag, meta['controller'], task, meta, json_path, console, full, film)
         failure = failure or failed(result)
     if 'interrupted' in meta:
         if bag.exists():
-            _print(console, f'interrupted; kept {bag}')
+            _print(console, 'interrupted; kept what was flown')
         raise KeyboardInterrupt
     if failure:
         _complain(failure + slow)
@@ -279,7 +308,7 @@ class Flight(Operator):
             raise RunError(status.message)
 
 
-def _report(bag, controller, task, meta, json_path, console) -> dict:
+def _report(bag, controller, task, meta, json_path, console, full, film) -> dict:
     if (bag / 'metadata.yaml').exists():
         add_meta(bag, meta)
     log = read_bag(bag)
@@ -287,6 +316,9 @@ def _report(bag, controller, task, meta, json_path, console) -> dict:
         _print(console, line, style='yellow')
     results = {'meta': meta, controller: metrics(log, task)}
     if log.targets:     # a controller flew
-        table.print_results(results, console)
+        table.print_results(results, console, full=full)
     write_json(json_path, results)
+    if film and len(motion(log)):
+        from beetle_omni_ros.show.recorded import recorded_scene  # viser takes a second
+        write_text(bag / FILM, recorded_scene({controller: log}), 'film')
     return results[controller]

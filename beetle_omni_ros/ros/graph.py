@@ -9,6 +9,7 @@ from collections.abc import MutableMapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from itertools import count
+from operator import itemgetter
 import os
 from pathlib import Path
 import re
@@ -109,8 +110,8 @@ def _ports_are_free(domain):
 # --- nodes ------------------------------------------------------------------------------------
 
 def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str = '',
-         policy: str = '', allow_other_robot: bool = False, simulated: bool = True,
-         actuators: str | None = None, ports: str = '', robot_file: str = '', plant_file: str = '',
+         policy: str = '', simulated: bool = True, actuators: str | None = None,
+         ports: str = '', robot_file: str = '', plant_file: str = '',
          conditions: str = 'nominal', seed: int = 0, task: str = '', bag: str = '',
          viewer: bool = False, clock: str = 'system',
          components: Sequence[str] = ()) -> tuple[Parameters, dict[str, str]]:
@@ -138,8 +139,7 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
     robot = {'robot_file': robot_file} if robot_file else {}
     plant = {'robot_file': plant_file} if plant_file else robot
     controllers, left_out = controller_nodes(
-        controller, robot, standby=standby, nmpc=nmpc, policy=policy,
-        allow_other_robot=allow_other_robot)
+        controller, robot, standby=standby, nmpc=nmpc, policy=policy)
     active = registry.find(controller).name
     # The default of these nodes is the list of standby controllers.
     others = {} if active in registry.STANDING_BY else {
@@ -184,8 +184,7 @@ def in_simulated_time(nodes: Parameters) -> Parameters:
 
 
 def controller_nodes(controller: str, robot: dict, *, standby: bool = True, nmpc: str = '',
-                     policy: str = '', allow_other_robot: bool = False
-                     ) -> tuple[Parameters, dict[str, str]]:
+                     policy: str = '') -> tuple[Parameters, dict[str, str]]:
     """
     Return the parameters of the controllers' nodes, the active one first.
 
@@ -212,8 +211,7 @@ def controller_nodes(controller: str, robot: dict, *, standby: bool = True, nmpc
         if entry.policy_file:
             given = policy if entry.name == registry.OWNER['--policy'] else ''
             values |= {'policy': str(Path(given).absolute())} if given else {}
-            values |= {'allow_other_robot': True} if allow_other_robot else {}
-            if reason := unfit(given or entry.policy_file, robot_file, allow_other_robot):
+            if reason := unfit(given or entry.policy_file, robot_file):
                 if entry is first or given:
                     raise ParameterError(reason)
                 left_out[entry.name] = reason
@@ -222,11 +220,11 @@ def controller_nodes(controller: str, robot: dict, *, standby: bool = True, nmpc
     return nodes, left_out
 
 
-def unfit(policy: str, robot_file: str | None, allow_other_robot: bool) -> str:
+def unfit(policy: str, robot_file: str | None) -> str:
     """Return why a policy is unusable for the robot file, or ''."""
     try:
         from beetle_omni_ros.control.policy_file import PolicyNetwork
-        PolicyNetwork(policy, RobotParameters.load(robot_file), allow_other_robot)
+        PolicyNetwork(policy, RobotParameters.load(robot_file))
     except (ParameterError, ImportError) as error:
         return str(error)
     return ''
@@ -320,15 +318,23 @@ class Graph:
             self.kill(name)
         return left
 
+    def lines(self) -> list[str]:
+        """Return the logged lines of all processes in the order of their times."""
+        timed, t = [], ''
+        for name in self.processes:
+            for line in self.log(name).read_text(errors='replace').splitlines():
+                # '[WARN] [1700000000.123456789] [node]: text', or a further line of it
+                t = line.partition('] [')[2].partition(']')[0] or t
+                timed.append((t, line))
+        return [line for _, line in sorted(timed, key=itemgetter(0))]
+
     def warnings(self) -> list[str]:
         """Return logged warnings and errors, without duplicates, in the order of their times."""
         lines: dict[str, str] = {}
-        for name in self.processes:
-            for line in self.log(name).read_text(errors='replace').splitlines():
-                if '[WARN]' in line or '[ERROR]' in line or ': error: ' in line:
-                    lines.setdefault(line.split(']: ', 1)[-1], line)
-        # '[WARN] [1700000000.123456789] [node]: text'
-        return sorted(lines.values(), key=lambda line: line.partition('] ')[2])
+        for line in self.lines():
+            if '[WARN]' in line or '[ERROR]' in line or ': error: ' in line:
+                lines.setdefault(line.split(']: ', 1)[-1], line)
+        return list(lines.values())
 
 
 def child_environment(domain: int) -> dict[str, str]:

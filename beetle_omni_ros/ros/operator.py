@@ -44,7 +44,7 @@ SENSORS = {'mocap/pose': 'position', 'imu/data_raw': 'specific_force',
            'joint_states': 'position', 'battery_state': 'voltage'}
 # Only the newest message of these is read for each picture; of the others, every message is read.
 SHOWN = ('odom', 'ground_truth/odom', 'joint_states', 'command', 'battery_state')
-EVENTS = ('supervisor/state', 'disturbance', 'diagnostics')
+EVENTS = ('supervisor/state', 'reference/state', 'disturbance', 'diagnostics')
 NEWEST = Qos(1, reliable=False)
 SPIN = 0.01             # s of a picture's 33 ms in which messages are received
 NICENESS = 10           # of the view; the nodes of the flight have precedence
@@ -324,7 +324,7 @@ def run_live(*, namespace: str = '', domain_id: int | None = None,
         graph = LiveGraph(namespace, domain_id)
         stack.callback(graph.close)
         os.nice(NICENESS)
-        server = serve(host, port)
+        server = serve(host, port, f'ROS domain {graph.domain}')
         stack.callback(close, server)
         announce(host, server.get_port())
         if graph.domain not in domains_in_use():

@@ -9,18 +9,19 @@ from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
 from beetle_omni_ros.bags.log import (
-    errors,
     estimate_errors,
     FlightLog,
     hold,
     motion,
     reference_poses,
     roll_pitch_yaw,
+    spans,
+    target_errors,
 )
 from beetle_omni_ros.bags.metrics import L_WINDOW, U_WINDOW
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.model.schema import shortened
-from beetle_omni_ros.show.figures import COLOURS, FAINT, INK, PARTS
+from beetle_omni_ros.model.schema import ParameterError, shortened
+from beetle_omni_ros.show.figures import BLUE, COLOURS, FAINT, GREY, INK, PARTS, RED, VIOLET
 from beetle_omni_ros.show.page import rendered
 
 MAX_RUNS = len(COLOURS)     # each run has its own colour
@@ -32,6 +33,9 @@ FEW_POSES = 20          # up to this number, L and U windows are shaded
 MOST_MARKS = 12         # of faults in a chart, and states in a strip
 TINY = {'m': 1e-4, 'deg': 1e-2}     # floor of logarithmic errors
 L_COLOUR, U_COLOUR, GRID = '#eef1f5', '#cfe3d4', '#e6e9ed'
+# Colour -> the one on a dark page.
+NIGHT = {INK: '#dde2e8', L_COLOUR: '#252c35', U_COLOUR: '#254232', GRID: '#343b44',
+         BLUE: '#5d9fe8', RED: '#f0665c', VIOLET: '#ab86d3', GREY: '#98a3af'}
 AXES = ('x [m]', 'y [m]', 'z [m]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]')
 STATE_COLOURS = {'flying': '#9cc7a8', 'takeoff': '#b9cfe6', 'landing': '#f0d29a',
                  'fallback': '#efb08a', 'emergency_stop': '#d9534f'}
@@ -58,9 +62,12 @@ class Run:
                           line={'color': self.colour, 'width': 1.3, **style})
 
 
-def html(runs: list[Run]) -> str:
-    """Return charts below each other as HTML; they have one time axis and one legend."""
-    charts = _charts(runs)
+def figure(runs: list[Run], *names: str) -> go.Figure:
+    """Return all charts below each other, or those whose titles begin with a name."""
+    charts = [chart for chart in _charts(runs) if not names or chart[0].startswith(names)]
+    if not charts:
+        raise ParameterError(f"charts {', '.join(names)}: expected the begin of one of "
+                             + ', '.join(label for label, _ in _charts(runs)))
     figure = make_subplots(
         len(charts), 1, shared_xaxes=True, vertical_spacing=0.25 / len(charts),
         row_heights=[STRIP * len(runs) if traces[0].type == 'bar' else ROW
@@ -77,7 +84,7 @@ def html(runs: list[Run]) -> str:
             _mark(figure, runs, row)
         figure.update_yaxes(type='log' if of_target or label.startswith('CPU') else '-',
                             row=row, col=1, zeroline=False, exponentformat='power')
-    figure.update_xaxes(gridcolor=GRID)
+    figure.update_xaxes(gridcolor=GRID, zeroline=False)
     figure.update_yaxes(gridcolor=GRID)
     figure.update_xaxes(title='time since the first target [s]', row=len(charts), col=1)
     figure.update_annotations(font={'size': 12, 'color': INK})
@@ -86,12 +93,17 @@ def html(runs: list[Run]) -> str:
         margin={'l': 50, 'r': 10, 't': 50, 'b': 40}, plot_bgcolor='#ffffff', barmode='overlay',
         legend={'orientation': 'h', 'y': 1, 'yanchor': 'top', 'yref': 'container'},
         hovermode='x', dragmode='zoom')
-    found, times = json.loads(figure.to_json()), {}
+    return figure
+
+
+def html(runs: list[Run]) -> str:
+    """Return the charts as HTML."""
+    found, times = json.loads(figure(runs).to_json()), {}
     for trace in found['data']:     # lines of one clock share its times; a target has float64
         if isinstance(trace['x'], dict) and trace['x']['dtype'] == 'f4':
             trace['x'] = times.setdefault(trace['x']['bdata'], len(times))
     return rendered('charts.html', plotly=get_plotlyjs(), figure={**found, 'times': list(times)},
-                    bins=BINS)
+                    bins=BINS, night=NIGHT)
 
 
 def _mark(figure, runs, row):
@@ -122,7 +134,7 @@ def _thinned(t, values):
 
 def _charts(runs):
     """(label, lines or bars) of each chart that has data."""
-    away = [(run, _errors(run)) for run in runs]
+    away = [(run, target_errors(run.log)) for run in runs]
     made = [(f'{name} error [{unit}]', [run.line(found[0], np.maximum(found[k], TINY[unit]))
                                         for run, found in away if len(found[0])])
             for k, name, unit in ((1, 'position', 'm'), (2, 'orientation', 'deg'))]
@@ -151,21 +163,6 @@ def _charts(runs):
     return [(label, traces) for label, traces in made if traces]
 
 
-def _spans(run):
-    """(target, its end [s]) of each target."""
-    targets = run.log.targets
-    return zip(targets, [t.stamp for t in targets[1:]] + [run.log.end])
-
-
-def _errors(run):
-    """(n,) times [s], (n,) position errors [m], (n,) orientation errors [deg]."""
-    body, parts = motion(run.log), [np.zeros((3, 0))]
-    for target, end in _spans(run):
-        window = body.window(target.stamp, end - 1e-3)
-        parts.append(np.array([body.t[window], *errors(body, target, window)]))
-    return np.concatenate(parts, axis=1)
-
-
 def _poses(runs):
     """Position and angles of every run and its target; angles within 180 deg of it."""
     made: list[tuple[str, list]] = [(label, []) for label in AXES]
@@ -192,8 +189,8 @@ def _wanted(run):
     """Times (n,) [s] and position [m] and angles [deg] (n, 6) of the targets."""
     times = [np.array([target.stamp, end]) if isinstance(target, PoseTarget) else
              np.arange(target.times[0], min(end, target.times[-1]), TRAJECTORY_STEP)
-             for target, end in _spans(run)]
-    poses = [reference_poses(target, t) for (target, _), t in zip(_spans(run), times)]
+             for target, end in spans(run.log)]
+    poses = [reference_poses(target, t) for (target, _), t in zip(spans(run.log), times)]
     return np.concatenate(times), np.concatenate(
         [np.hstack([position, roll_pitch_yaw(quaternion)]) for position, quaternion in poses])
 

@@ -1,29 +1,37 @@
 """Style of figures, and figures as part of a page."""
 
 import base64
+from collections.abc import Iterable
 from io import BytesIO
 from typing import Any
+from zlib import crc32
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-COLOURS = ('#1f5fa8', '#d1432f', '#2f8f5b', '#d98a1c', '#7a52a3', '#5b6770')  # one for each run
-PARTS = ('#1f5fa8', '#d98a1c', '#2f8f5b', '#b0447a')  # one for each joint, rotor or axis
+from beetle_omni_ros.bags.log import FlightLog
+
+# Every colour of a figure, page or scene that has a meaning.
+BLUE, RED, GREEN, AMBER, VIOLET, GREY = COLOURS = (
+    '#1b5fb4', '#c8281e', '#2f8f5b', '#d98a1c', '#7a52a3', '#5b6770')
+OTHERS = (GREEN, VIOLET, '#008c95', '#a0522d', '#6b7f1e', '#b0447a')  # of what has no colour
+PARTS = (BLUE, AMBER, GREEN, '#b0447a')     # one for each joint, rotor or axis
+BEFORE, AFTER = AMBER, GREEN    # a model before and after an identification
 INK, FAINT = '#22272e', '#8a939d'
 WIDTH = 9.6  # [in] of a page-wide figure
 # Controller -> colour and dashes: blue for RL and red for NMPC as in the publication. The variants
 # are lighter and dashed, so that readers who cannot distinguish the colours can also read them.
 LINES: dict[str, tuple[str, str | tuple]] = {
-    'nmpc': ('#c8281e', '-'),
-    'rl': ('#1b5fb4', '-'),
+    'nmpc': (RED, '-'),
+    'rl': (BLUE, '-'),
     'rl_bare': ('#0b2d5c', (0, (2, 1))),
     'rl_any': ('#58b4e8', (0, (5, 1.6))),
     'rl_late': ('#4b3f9e', (0, (6, 1.6))),
     'rl_published': ('#3f8f8a', (0, (4, 1, 1, 1))),
     'nmpc_corrected': ('#b5651d', (0, (5, 1.2))),
     'nmpc_published': ('#e8960c', (0, (3, 1.2, 1, 1.2))),
-    'hover': ('#5b6770', (0, (1, 1.2)))}
+    'hover': (GREY, (0, (1, 1.2)))}
 
 STYLE: dict[Any, Any] = {
     'font.family': 'sans-serif', 'font.size': 9, 'axes.titlesize': 9.5, 'axes.titleweight': 'bold',
@@ -34,6 +42,22 @@ STYLE: dict[Any, Any] = {
     'text.color': INK, 'legend.frameon': False, 'legend.fontsize': 8.5, 'lines.linewidth': 1.2,
     'path.simplify_threshold': 1.0, 'svg.hashsalt': 'beetle_omni', 'svg.fonttype': 'path',
     'figure.dpi': 100}
+
+
+def line_of(controller: str) -> tuple[str, str | tuple]:
+    """Colour and dashes of a controller; its name decides those of one outside the package."""
+    return LINES.get(controller, (OTHERS[crc32(controller.encode()) % len(OTHERS)],
+                                  (0, (4, 1, 1, 1))))
+
+
+def colours_of(logs: Iterable[FlightLog]) -> list[str]:
+    """One colour for each flight: that of its controller, or a free one if it is taken."""
+    made: list[str] = []
+    for log in logs:
+        first = line_of(next(iter(log.controllers()), ''))[0]
+        made.append(next((colour for colour in (first, *OTHERS, *COLOURS[2:])
+                          if colour not in made), FAINT))
+    return made
 
 
 def panels(rows: int, columns: int = 1, height: float = 1.5, **options):
@@ -52,8 +76,9 @@ def panels(rows: int, columns: int = 1, height: float = 1.5, **options):
 def legend(figure: Figure, axes: Axes) -> None:
     """Add one legend above the whole figure."""
     handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        figure.legend(handles, labels, loc='outside upper right', ncols=min(6, len(labels)))
+    if handles:     # in rows of equal length
+        rows = -(-len(labels) // 6)
+        figure.legend(handles, labels, loc='outside upper left', ncols=-(-len(labels) // rows))
 
 
 def svg(figure: Figure, alternative: str) -> str:

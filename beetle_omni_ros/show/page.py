@@ -1,10 +1,13 @@
 """Tables of text for the terminal, as Markdown and as HTML, and structure and style of pages."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from math import isfinite
 import os
+from pathlib import Path
+import shlex
 import sys
 
 from jinja2 import Environment, PackageLoader, select_autoescape
@@ -52,6 +55,7 @@ class Grid:
         faint_columns: indices of columns with published results.
         note: meaning of the columns, below the title.
         best: (row, column) of cells in bold.
+        unbroken: number of first columns that a terminal never breaks.
 
     """
 
@@ -62,18 +66,21 @@ class Grid:
     faint_columns: frozenset[int] = frozenset()
     note: str = ''
     best: frozenset[tuple[int, int]] = frozenset()
+    unbroken: int = 1
 
 
 def print_grids(shown: list[Grid], console: Console) -> None:
-    """Print tables; lines break between words only, and the first column never breaks."""
+    """Print tables; lines break between words only, and the first columns never."""
     for grid in shown:
         columns = list(zip(grid.header, *grid.rows, strict=True))
         table = Table(title=Text(grid.title) if grid.title else None, title_justify='left',
                       title_style='', box=None, min_width=min(len(grid.title), LONGEST_TITLE),
                       header_style='dim', padding=(0, SPACE, 0, 0))
         for k, (name, *cells) in enumerate(columns):
-            words = [word for cell in (name, *cells) for word in (cell.split() if k else [cell])]
-            table.add_column(Text(name), justify='right' if k else 'left', no_wrap=not k,
+            words = [word for cell in (name, *cells) for word in (
+                [cell] if k < grid.unbroken else cell.split())]
+            table.add_column(Text(name), justify='right' if k else 'left',
+                             no_wrap=k < grid.unbroken,
                              min_width=max(map(len, words), default=0),
                              style='dim' if k in grid.faint_columns else None)
         for k, row in enumerate(grid.rows):
@@ -81,6 +88,15 @@ def print_grids(shown: list[Grid], console: Console) -> None:
         console.print(table, crop=False)
         if grid.note:
             console.print(grid.note, style='dim', highlight=False, markup=False)
+
+
+def print_end(console: Console, files: Iterable[Path | None], *then: str | Sequence) -> None:
+    """Print the files of a command that exist, and what to do or the commands to type next."""
+    lines = [f'files: {file}' for file in files if file and file.exists()]
+    lines += [f'next:  {one}' if isinstance(one, str) else
+              f"next:  {shlex.join(['beetle_omni', *map(str, one)])}" for one in then]
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def markdown(grid: Grid, numeric: bool = False) -> str:

@@ -10,8 +10,10 @@ import numpy as np
 from beetle_omni_ros.bags.bag import read_flights
 from beetle_omni_ros.bags.log import FlightLog, motion
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.show.figures import COLOURS
+from beetle_omni_ros.show.figures import COLOURS, colours_of
+from beetle_omni_ros.show.page import rendered
 from beetle_omni_ros.show.scene import close, drawable, moments, Room, serve
+from beetle_omni_ros.show.table import title
 
 RATE, MOST = 20.0, 4000     # [Hz] of the pictures; of all robots
 TEXT_EVERY = 4              # pictures
@@ -21,32 +23,37 @@ LOCAL = '127.0.0.1'
 
 
 def recorded_scene(logs: Mapping[str, FlightLog]) -> str:
-    """Return the HTML of a player of flights by name, aligned by their first targets."""
+    """Make the HTML of a player of flights by name; a ParameterError refuses one without poses."""
+    for name, log in logs.items():
+        if not len(motion(log)):
+            raise ParameterError('; '.join([f'{name}: no pose of the robot; expected '
+                                            'ground_truth/odom or odom', *log.warnings]))
     begin = max(-BEFORE, min(motion(log).t[0] - log.begin for log in logs.values()))
     end = max(motion(log).t[-1] - log.begin for log in logs.values())
     step = max(1 / RATE, (end - begin) * len(logs) / MOST)
     times = np.arange(begin, end, step)
     server = serve(LOCAL, 8080)
     try:
-        room = Room(server, len(logs))
+        room = Room(server, colours_of(logs.values()))
         paths = [drawable(motion(log).position) for log in logs.values()]
         for number, path in enumerate(paths):
             room.draw_path(number, path[::max(1, len(path) // PATH_POINTS)])
-        every = np.concatenate(paths)
-        room.look_at(every.min(axis=0), every.max(axis=0))
         recording = server.get_scene_serializer()
-        texts = [''] * len(logs)
+        text = ''
         columns = [moments(log, log.begin + times) for log in logs.values()]
         with server.atomic():       # nothing is sent in between
             for k, row in enumerate(zip(*columns, strict=True)):
                 if k % TEXT_EVERY == 0:
-                    texts = [f'{name}: {times[k]:.1f} s, {moment.text()}' if moment else ''
-                             for name, moment in zip(logs, row)]
-                room.show(row, texts)
+                    text = '\n'.join([f'{times[k]:.1f} s', *(
+                        f'{name}: {moment.text()}' for name, moment in zip(logs, row) if moment)])
+                room.show(row, text)
                 recording.insert_sleep(float(step))
-        return recording.as_html()
+        page = recording.as_html()
     finally:
         close(server)
+    head = rendered('viewer.html', title=title(next(iter(logs.values())).meta),
+                    runs=zip(logs, colours_of(logs.values())))
+    return page.replace('</head>', head + '</head>', 1)
 
 
 def run_view(runs: list[Path], *, host: str, port: int) -> None:

@@ -13,8 +13,8 @@ from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.schema import shortened
 from beetle_omni_ros.show import charts, table
 from beetle_omni_ros.show.charts import MAX_RUNS, Run
-from beetle_omni_ros.show.figures import COLOURS
-from beetle_omni_ros.show.page import Grid, rendered, Terminal
+from beetle_omni_ros.show.figures import colours_of
+from beetle_omni_ros.show.page import Grid, print_end, rendered, Terminal
 from beetle_omni_ros.show.recorded import recorded_scene
 
 MOST_ROWS = 40      # of states, faults and warnings
@@ -22,7 +22,7 @@ LEVELS = {1: 'warning', 2: 'error', 3: 'stale'}     # of diagnostics
 
 
 def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None,
-               console: Console | None = None) -> dict:
+               full: bool = False, console: Console | None = None) -> dict:
     """
     Read runs, print their result table, write the page; return :func:`results_of` the runs.
 
@@ -30,26 +30,25 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     many runs, or a page that cannot be written.
     """
     console = console or Terminal()
-    logs = read_flights(paths, MAX_RUNS)
-    for log in logs.values():
-        for warning in log.warnings:
-            print(f'{log.source}: {warning}', file=sys.stderr)
-    runs = make_runs(logs)
+    runs = make_runs(read_flights(paths, MAX_RUNS))
     results = results_of(runs)
-    table.print_results(results, console)
     page = make_page(runs, results)
+    for run in runs:
+        for warning in run.log.warnings:
+            print(f'{run.log.source}: {warning}', file=sys.stderr)
+    table.print_results(results, console, full=full)
     write_text(output, page, 'report')
     write_json(json_path, results)
-    console.print(f'{output}: {len(page) / 1e6:.1f} MB', highlight=False)
+    print_end(console, [output, json_path], f'open {output} in a browser', ('view', *paths))
     return results
 
 
 def make_runs(logs: dict[str, FlightLog]) -> list[Run]:
-    """Compute the metrics of flights; give each a colour."""
+    """Compute the metrics of flights; give each the colour of its controller."""
     runs = []
-    for k, (name, log) in enumerate(logs.items()):
+    for (name, log), colour in zip(logs.items(), colours_of(logs.values()), strict=True):
         found = metrics_by_controller(log)
-        runs.append(Run(name, COLOURS[k % MAX_RUNS], log, {
+        runs.append(Run(name, colour, log, {
             f'{name}: {key}' if len(found) > 1 else name: result
             for key, result in found.items()}))
     return runs
@@ -68,13 +67,13 @@ def results_of(runs: list[Run]) -> dict:
 
 def make_page(runs: list[Run], results: dict) -> str:
     """Return the HTML of the page."""
-    grids, meta = table.grids(results, with_poses=True), results['meta']
+    grids, meta = table.grids(results, full=True), results['meta']
     return rendered(
         'report.html', title='Flight report', cards=map(_card, runs), charts=charts.html(runs),
         subtitle=', '.join(filter(None, [table.title(meta),
                                          f"beetle_omni_ros {meta['version']}"])),
-        tables=[grid for grid in grids if grid.title != 'Poses'],
-        poses=[grid for grid in grids if grid.title == 'Poses'],
+        tables=[grid for grid in grids if not grid.title.startswith('Poses')],
+        poses=[grid for grid in grids if grid.title.startswith('Poses')],
         scene=recorded_scene({run.label: run.log for run in runs}),
         faults=[grid for run in runs for grid in _faults(run) if grid.rows])
 

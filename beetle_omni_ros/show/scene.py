@@ -2,11 +2,10 @@
 
 from bisect import bisect_right
 from collections.abc import Sequence
-import contextlib
 from dataclasses import dataclass, field
-import io
 
 import numpy as np
+import rich
 import viser
 
 from beetle_omni_ros.bags.log import FlightLog, geodesic_angles, hold, motion
@@ -20,10 +19,12 @@ NEWTON_PER_METRE = 40.0     # force that is drawn as one metre
 THRUST, FORCE = (240, 140, 30), (210, 40, 60)
 GHOST_OPACITY = 0.35
 SKY = 4.0               # brightness of the ambient light, in place of slow reflections
-FLOOR = 20.0            # [m] width, with a line at each metre
+FLOOR, HORIZON = 80.0, 30.0     # [m] width, with a line at each metre; distance where it fades
 TARGET_AXES = 0.28      # [m]
-LABEL_HEIGHT, LABEL_STEP = 0.38, 0.1    # [m] above base_link; for each further robot
-VIEW_FROM, SMALLEST_VIEW = np.array([-0.5, -0.8, 0.36]), 2.0     # [m]
+LABEL_HEIGHT = 0.5      # [m] above the robot
+# Of the camera from the robot [m], and its vertical angle [rad]: the robot fills a third.
+VIEW_FROM, VIEW_ANGLE = np.array([-1.2, -1.95, 0.5]), np.radians(48)
+WORLD = '/world'        # moves against the followed robot, so that the camera need not
 SIDES = 24
 LARGEST = 1e6           # [m, rad, N] of what is drawn; a damaged bag may have any number
 Placed = tuple[np.ndarray, np.ndarray]      # position (3,) in world [m], quaternion (4,)
@@ -90,34 +91,34 @@ def wxyz(quaternion: np.ndarray) -> np.ndarray:
     return np.roll(quaternion, 1)
 
 
-def serve(host: str, port: int) -> viser.ViserServer:
+def serve(host: str, port: int, title: str = 'beetle_omni') -> viser.ViserServer:
     """Start a server at a port or the next free one; ParameterError: an unusable address."""
+    rich.get_console().quiet = True     # of viser, which prints its addresses, also in a notebook
     try:
-        with contextlib.redirect_stdout(io.StringIO()):     # viser prints its own addresses
-            server = viser.ViserServer(host, port, label='beetle_omni', verbose=False)
+        server = viser.ViserServer(host, port, label=title, verbose=False)
     except (OSError, OverflowError, RuntimeError, UnicodeError) as error:
         raise ParameterError(f'--host {host} --port {port}: cannot be served there '
                              f'({error})') from None
-    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width='small')
     return server
 
 
 def close(server: viser.ViserServer) -> None:
     """Stop a server without its message."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
+    server.stop()
+    rich.get_console().quiet = False
 
 
 class Robot:
     """
-    A robot in the scene, with its target and a text above it.
+    A robot in the scene, with its target.
 
     The robot with the ``number`` 0 has the colours of the model, the others are transparent.
     """
 
-    def __init__(self, scene, number: int):
-        tint = _colour(number) if number else None
-        name = f'/robot{number}'
+    def __init__(self, scene, number: int, colour: str):
+        tint = _rgb(colour) if number else None
+        name = f'{WORLD}/robot{number}'
         self._root = scene.add_frame(name, show_axes=False, visible=False)
         self._joints, self._arrows, paths = {}, {}, {}
         for link in links():
@@ -132,14 +133,12 @@ class Robot:
                     head_radius=0.02, head_length=0.04)
             for k, (shape, colour) in enumerate(link.shapes):
                 _add(scene, f'{path}/{k}', shape, colour, tint)
-        self._target = scene.add_frame(f'/target{number}', axes_length=TARGET_AXES,
+        self._target = scene.add_frame(f'{WORLD}/target{number}', axes_length=TARGET_AXES,
                                        axes_radius=0.008, origin_radius=0.018, visible=False)
-        self._force = scene.add_arrows(f'/force{number}', np.zeros((1, 2, 3)), FORCE,
+        self._force = scene.add_arrows(f'{WORLD}/force{number}', np.zeros((1, 2, 3)), FORCE,
                                        shaft_radius=0.012, head_radius=0.03, head_length=0.06)
-        self._label = scene.add_label(f'{name}/label', '', anchor='bottom-center', position=(
-            0.0, 0.0, LABEL_HEIGHT + LABEL_STEP * number))
 
-    def show(self, moment: Moment | None, text: str = '') -> None:
+    def show(self, moment: Moment | None) -> None:
         """Draw the robot at one moment, or hide it."""
         self._root.visible = moment is not None
         self._target.visible = moment is not None and moment.target is not None
@@ -153,12 +152,10 @@ class Robot:
         if moment.target is not None:
             self._target.position, self._target.wxyz = moment.target[0], wxyz(moment.target[1])
         self._force.points = _arrow(moment.position, moment.force)
-        if self._label.text != text:
-            self._label.text = text
 
 
-def _colour(number):
-    return tuple(bytes.fromhex(COLOURS[number][1:]))
+def _rgb(colour):
+    return tuple(bytes.fromhex(colour[1:]))
 
 
 def _arrow(begin, force):
@@ -167,36 +164,43 @@ def _arrow(begin, force):
 
 
 class Room:
-    """Floor, light, camera and robots."""
+    """Floor, light, camera, robots of these colours, one text above the followed robot."""
 
-    def __init__(self, server: viser.ViserServer, robots: int = 1):
-        scene = server.scene
+    def __init__(self, server: viser.ViserServer, colours: Sequence[str] = COLOURS[:1]):
+        scene, camera = server.scene, server.initial_camera
         # Shadows and reflections would dominate the rendering time without a graphics card.
         scene.configure_default_lights(cast_shadow=False)
         scene.configure_environment_map(None)
         scene.add_light_ambient('/sky', intensity=SKY)
-        scene.add_grid('/floor', FLOOR, FLOOR, cell_size=1.0, section_size=FLOOR,
-                       infinite_grid=False, shadow_opacity=0.0)
-        self._server, self._scene = server, scene
-        self.robots = [Robot(scene, number) for number in range(robots)]
+        self._world = scene.add_frame(WORLD, show_axes=False)
+        scene.add_grid(f'{WORLD}/floor', FLOOR, FLOOR, cell_size=1.0, section_size=FLOOR,
+                       fade_distance=HORIZON, shadow_opacity=0.0, cell_color=(150, 158, 166),
+                       plane_color=(128, 134, 140), plane_opacity=0.25)
+        self._label = scene.add_label('/label', '', anchor='bottom-center',
+                                      position=(0.0, 0.0, LABEL_HEIGHT))
+        self._scene, self._colours = scene, colours
+        camera.look_at, camera.position, camera.fov = np.zeros(3), VIEW_FROM, VIEW_ANGLE
+        self.robots = [Robot(scene, number, colour) for number, colour in enumerate(colours)]
 
-    def show(self, moments: Sequence[Moment | None], texts: Sequence[str]) -> None:
-        """Draw all robots at one moment."""
-        for robot, moment, text in zip(self.robots, moments, texts, strict=True):
-            robot.show(moment, text)
+    def show(self, moments: Sequence[Moment | None], text: str, follow: bool = True) -> None:
+        """Draw all robots at one moment; ``follow`` the first of them that has a pose."""
+        for robot, moment in zip(self.robots, moments, strict=True):
+            robot.show(moment)
+        if follow and (first := next(filter(None, moments), None)):
+            self._world.position = -first.position
+        if self._label.text != text:
+            self._label.text = text
 
-    def look_at(self, low: np.ndarray, high: np.ndarray) -> None:
-        """Set the initial camera, to see the region between two corners (3,) [m]."""
-        camera, centre = self._server.initial_camera, (low + high) / 2
-        camera.look_at = centre
-        camera.position = centre + VIEW_FROM * max(
-            SMALLEST_VIEW, float(np.linalg.norm(high - low)))
+    def draw_path(self, number: int, positions: np.ndarray):
+        """Draw the path (N, 3) [m] of a robot; returns its handle, whose ``points`` may change."""
+        return self._scene.add_line_segments(
+            f'{WORLD}/path{number}', segments(positions), _rgb(self._colours[number]),
+            thickness=1.5, thickness_units='screen')
 
-    def draw_path(self, number: int, positions: np.ndarray) -> None:
-        """Draw the path (N, 3) [m] of a robot."""
-        self._scene.add_line_segments(
-            f'/path{number}', np.stack([positions[:-1], positions[1:]], axis=1),
-            _colour(number), thickness=1.5, thickness_units='screen')
+
+def segments(positions: np.ndarray) -> np.ndarray:
+    """Return the lines (N - 1, 2, 3) between positions (N, 3) [m]."""
+    return np.stack([positions[:-1], positions[1:]], axis=1)
 
 
 def _add(scene, name, shape, colour, tint):

@@ -5,21 +5,20 @@ from collections.abc import Callable
 from rich.console import Console
 
 from beetle_omni_ros.bags.metrics import at
+from beetle_omni_ros.model.schema import shortened
 from beetle_omni_ros.show.page import ABSENT, Grid, number, print_grids, Terminal
 
 FILES, SHIPPED_ROBOT = ('robot', 'plant'), 'params/robot.yaml'    # keys in the metadata
-MANY_POSES = 20  # above this number, only the summary is shown
 
-POSE_ROWS = 'U: hovering, 7.0 to 7.5 s after each target; L: on the way, 1 to 7 s'
+POSE = '{:5.2f} {:5.2f} {:4.2f} {:4.0f} {:4.0f} {:4.0f}'
+NOTE = 'Means over the poses. U: 7.0 to 7.5 s after each target; L: 1 to 7 s after it.'
 ERROR_ROWS = (  # text, path in the metrics, digits
-    ('U position, mean [m]', 'mean.U_position_m', 4),
-    ('U position, max [m]', 'max.U_position_m', 4),
-    ('U orientation, mean [deg]', 'mean.U_orientation_deg', 2),
-    ('U orientation, max [deg]', 'max.U_orientation_deg', 2),
-    ('L position, mean [m]', 'mean.L_position_m', 3),
-    ('L position, max [m]', 'max.L_position_m', 3),
-    ('L orientation, mean [deg]', 'mean.L_orientation_deg', 2),
-    ('L orientation, max [deg]', 'max.L_orientation_deg', 2))
+    ('error at the target, U [m]', 'mean.U_position_m', 4),
+    ('error at the target, U [deg]', 'mean.U_orientation_deg', 2),
+    ('error on the way, L [m]', 'mean.L_position_m', 3),
+    ('error on the way, L [deg]', 'mean.L_orientation_deg', 2))
+LARGEST_ROWS = [(f'largest {text}', path.replace('mean', 'max'), digits)
+                for text, path, digits in ERROR_ROWS]
 EFFORT_ROWS = (
     ('|q* - q| [rad]', 'joint_error_mean_rad', 4),
     ('thrust [N]', 'thrust_mean_N', 2),
@@ -127,25 +126,27 @@ KINDS: dict[str, tuple[str, str, Callable, tuple]] = {
         ('overshoot [%]', 'overshoot_percent', 1)))}
 
 
-def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
+def grids(results: dict, *, full: bool = False) -> list[Grid]:
     """
     Make the tables of a result.
 
     Args:
         results: JSON of ``evaluate``, ``fly`` or ``report``; keys other than ``meta`` are labels.
-        with_poses: whether to show every pose; None: if there are at most 20.
+        full: with largest errors, effort, CPU times, all parts of a task and all poses.
 
     """
     task = str(results.get('meta', {}).get('task', ''))
     by_label = {name: result for name, result in results.items() if name != 'meta'}
-    made = [_summary(by_label, task)]
+    made = [_summary(by_label, task, full)]
     for key, (title, heading, parts, columns) in KINDS.items():
+        # The last part is that of all, or the level with the largest errors.
         found = [(label, *part) for label, result in by_label.items() if key in result
-                 for part in parts(result[key])]
+                 for part in parts(result[key])[0 if full or key == 'steps' else -1:]]
         if found:
             others = {'trajectory': LEMNISCATE if task == 'lemniscate' else {}, 'wind': WIND,
                       'pushes': PUSHED}.get(key, {})
-            printed = [(f'published {name}', 'all', part) for name, part in others.items()]
+            printed = [(f'published {name}', 'all', part)
+                       for name, part in _in_order(others, by_label).items()]
             if key == 'steps':
                 printed = [('published NMPC', axis, {'rise_s': rise})
                            for axis, rise in RISE.items()]
@@ -154,14 +155,17 @@ def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
             made.append(Grid(title, ['', heading, *(text for text, *_ in columns)], rows,
                              frozenset(range(len(found), len(rows)))))
     groups: dict[tuple, dict] = {}      # results with equal targets, which one table compares
-    for label, result in by_label.items():
+    for label, result in by_label.items() if full else ():
         targets = tuple(round(v, 6) for pose in result['poses'] for v in pose['target'])
         groups.setdefault(targets, {})[label] = result['poses']
-    for group in groups.values():
-        count = len(next(iter(group.values())))
-        if count and with_poses or (with_poses is None and 1 < count <= MANY_POSES):
-            made.append(_poses(group))
-    return made
+    return made + [_poses(group) for targets, group in groups.items() if targets]
+
+
+def _in_order(others, by_label):
+    """Published results in the order of the controllers that flew, the rest behind them."""
+    flown = [*(result.get('controller', name) for name, result in by_label.items()), 'rl', 'nmpc']
+    return dict(sorted(others.items(),
+                       key=lambda item: flown.index(item[0].lower().partition(',')[0])))
 
 
 def _cell(part, path, digits):
@@ -181,54 +185,60 @@ def _numbered(parts):
     return [(str(k + 1), part) for k, part in enumerate(parts)]
 
 
-def _summary(by_label, task):
+def _summary(by_label, task, full):
     """Table with a column for each controller and published result, a row for each metric."""
-    others = POSES.get(task, {})
+    others = _in_order(POSES.get(task, {}), by_label)
     columns = [*by_label.values(), *others.values()]
     # The only pose of a trajectory is its start: to reach it says nothing about the path.
     posed = not all('trajectory' in result for result in by_label.values())
-    rows = [[text, *(_cell(column, path, digits) for column in columns)]
-            for text, path, digits in (ERROR_ROWS if posed else ())]
-    if posed:
-        rows.append(['poses reached', *(
-            _reached(column['poses']) if 'poses' in column else ABSENT for column in columns)])
+    shown: list[tuple] = [('poses reached', reached), *ERROR_ROWS] if posed else []
     if any('landing' in column for column in columns):
-        rows.append(['landing [m/s]', *(
-            ('fell, ' if at(column, 'landing.fell') else '') + _cell(
-                column, 'landing.speed_m_s', 2) for column in columns)])
-    if any('ended' in column for column in columns):
-        rows.append(['ended', *(column.get('ended', ABSENT) for column in columns)])
-    rows.append(['crashed', *({True: 'yes', False: 'no'}.get(column.get('crashed'), ABSENT)
-                              for column in columns)])
-    rows += [[text, *(_cell(column, path, digits) for column in columns)]
-             for text, path, digits in EFFORT_ROWS]
-    if any(column.get('guidance') for column in columns):
-        rows.append(['guidance', *(column.get('guidance') or ABSENT for column in columns)])
+        shown.append(('landing [m/s]', lambda column: 'fell, ' * bool(at(column, 'landing.fell'))
+                      + _cell(column, 'landing.speed_m_s', 2)))
+    shown.append(('alarms', alarms))
+    if any(column.get('crashed') or 'ended' in column for column in columns):
+        shown.append(('ended early', lambda column: '; '.join(filter(None, (
+            'crashed' * bool(column.get('crashed')), column.get('ended')))) or ABSENT))
+    if full:
+        shown += [*(LARGEST_ROWS if posed else ()), *EFFORT_ROWS,
+                  ('guidance', lambda column: column.get('guidance') or ABSENT)]
+    rows = [[text, *(what[0](column) if callable(what[0]) else _cell(column, *what)
+                     for column in columns)] for text, *what in shown]
     first = len(by_label) + 1
-    return Grid(POSE_ROWS if posed else 'Flight',
-                ['', *by_label, *(f'published {name}' for name in others)], rows,
-                faint_columns=frozenset(range(first, first + len(others))))
+    return Grid('', ['', *by_label, *(f'published {name}' for name in others)], rows,
+                faint_columns=frozenset(range(first, first + len(others))),
+                note=NOTE if posed else '')
 
 
-def _reached(poses):
+def alarms(column: dict) -> str:
+    """Return the first faults that the supervisor named, and the number of the others."""
+    if 'alarms' not in column:
+        return ABSENT
+    first, others = list(column['alarms'])[:2], len(column['alarms']) - 2
+    return ', '.join(map(shortened, first)) + f' +{others}' * (others > 0) or 'none'
+
+
+def reached(column: dict) -> str:
+    """Return the number of reached poses, and of those in fallback."""
+    if 'poses' not in column:
+        return ABSENT
+    poses = column['poses']
     text = f"{sum(pose['reached'] for pose in poses)} of {len(poses)}"
     hovered = sum('fallback' in pose for pose in poses)
     return f'{text}, {hovered} in fallback' if hovered else text
 
 
 def _poses(by_label):
-    header = ['', 'x y z [m] roll pitch yaw [deg]'] + [
-        f'{name}: {what}' for name in by_label for what in ('U [m]', '[deg]')]
-    rows = []
-    for k, poses in enumerate(zip(*by_label.values(), strict=True)):
-        target = poses[0]['target']
-        row = [str(k + 1), ' '.join([*(f'{v:.2f}' for v in target[:3]),
-                                     *(f'{v:.0f}' for v in target[3:])])]
-        for pose in poses:
-            row += [number(pose['U_position_m'], 4) + ('' if pose['reached'] else ' ✗'),
-                    number(pose['U_orientation_deg'], 2)]
-        rows.append(row)
-    return Grid('Poses', header, rows)
+    """Table with a row for each pose, a column for each result."""
+    def cell(pose):
+        distance, angle = pose['U_position_m'], pose['U_orientation_deg']
+        return f'{number(distance, 4)} {number(angle, 2 if (angle or 0.0) < 10 else 0)}' \
+            + ' ✗' * (not pose['reached'])
+
+    rows = [[str(k + 1), POSE.format(*poses[0]['target']), *map(cell, poses)]
+            for k, poses in enumerate(zip(*by_label.values(), strict=True))]
+    return Grid('Poses: U [m] and [deg]', ['', 'x y z [m] roll pitch yaw [deg]', *by_label], rows,
+                unbroken=2)
 
 
 def title(meta: dict) -> str:
@@ -238,9 +248,9 @@ def title(meta: dict) -> str:
                      and (key not in FILES or str(meta[key]) != SHIPPED_ROBOT))
 
 
-def print_results(results: dict, console: Console | None = None) -> None:
-    """Print the tables of a result to the terminal."""
+def print_results(results: dict, console: Console | None = None, *, full: bool = False) -> None:
+    """Print the tables of a result to the terminal; ``full`` as of :func:`grids`."""
     console = console or Terminal()
     if known := title(results.get('meta', {})):
-        console.print(known, style='bold', highlight=False, markup=False)
-    print_grids(grids(results), console)
+        console.print(known, style='bold', highlight=False, markup=False, soft_wrap=True)
+    print_grids(grids(results, full=full), console)

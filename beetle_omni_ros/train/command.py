@@ -97,8 +97,8 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
         'iterations_done': done, 'samples': done * parameters.ppo.steps * parameters.ppo.robots,
         'seconds': round(runner.trained_seconds, 1),
         'device': torch.cuda.get_device_name(where) if where.startswith('cuda') else 'cpu'})
-    console.print(f'{path}: agrees with torch to {difference:.1e}; fly it with beetle_omni '
-                  f'evaluate --controllers rl --policy {path} --task random100', soft_wrap=True)
+    console.print(f'files: {path}, agrees with torch to {difference:.1e}\nnext:  beetle_omni '
+                  f'evaluate --controllers rl --policy {path}', soft_wrap=True)
     write_json(json_path, {'policy': str(path), 'iterations': done,
                            'seconds': runner.trained_seconds, 'onnx_difference': difference})
 

@@ -128,7 +128,7 @@ def test_only_its_latest_commands_put_the_policy_in_charge(tmp_path):
 
 def test_the_disturbance_of_another_robot_is_its_difference_from_that_of_the_training(tmp_path):
     heavy = replace(ROBOT, mass=ROBOT.mass + 0.5)
-    policy = controller(write(tmp_path / 'p.onnx', memory=True), heavy, allow_other_robot=True)
+    policy = controller(write(tmp_path / 'p.onnx', memory=True), heavy, matching=False)
     still = {'velocity': np.zeros(3), 'quaternion': LEVEL, 'angular_velocity': np.zeros(3),
              'tilt': np.zeros(4)}
     for k in range(400):
@@ -136,6 +136,17 @@ def test_the_disturbance_of_another_robot_is_its_difference_from_that_of_the_tra
         hover = Command(stamp - 0.01, np.zeros(4), np.full(4, heavy.hover_thrust))
         policy.step(state(stamp, hover, **still), TARGET)
     assert policy.diagnostics()['force_estimate_N'] == pytest.approx(0.5 * ROBOT.gravity, abs=0.1)
+
+
+def test_a_known_weak_rotor_gets_more_of_the_thrust_that_the_policy_asks_for(tmp_path):
+    weak = replace(ROBOT, effects={'thrust_coefficient': {'scale': 0.8}})
+    path = write(tmp_path / 'p.onnx', bias=[0.0] * 8)
+    hover = Command(0.99, np.zeros(4), np.full(4, ROBOT.hover_thrust / 0.8))
+    still = {'velocity': np.zeros(3), 'quaternion': LEVEL, 'angular_velocity': np.zeros(3),
+             'tilt': np.zeros(4)}
+    sent = [controller(path, weak, matching=matching).step(
+        state(1.0, hover, **still), TARGET).thrust for matching in (True, False)]
+    np.testing.assert_allclose(sent[0], sent[1] / 0.8, rtol=0.01)
 
 
 def test_the_policy_with_memory_observes_a_push_in_body_axes(tmp_path):

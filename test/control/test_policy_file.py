@@ -37,8 +37,7 @@ def table(change):
     ({'action_scale': '[0.25]'}, ['action_scale', 'None']),
     ({'action_offset': '[0, 0, 0, 0, NaN, 1, 1, 1]'}, ['action_offset', 'nan']),
     ({'rate_hz': '200'}, ['rate_hz', '100', '200']),
-    ({'robot_hash': '1:feedbeef'},
-     ['robot_hash', '1:feedbeef', robot_hash(ROBOT), 'allow_other_robot']),
+    ({'robot_hash': '1:feedbeef', 'robot_values': '{}'}, ['robot_values', 'missing']),
     ({'observations': table(list.reverse)}, ['observations', 'velocity']),
     ({'observations': table(lambda rows: rows[5].update(size=8))},
      ['tilt', "'size': 4", "'size': 8"]),
@@ -71,16 +70,13 @@ def test_a_history_without_whole_rows_is_refused(tmp_path, size):
     (replace(ROBOT, multibody=None), [
         'mass 0.16444 in training, None here', 'multibody.module.centre_of_mass',
         'multibody.module.inertia'])])
-def test_another_robot_is_refused_with_the_parameters_and_may_be_allowed(flown, named):
+def test_another_robot_is_described_by_its_parameters(flown, named):
     contract = PolicyContract.default(ROBOT)
-    with pytest.raises(ParameterError, match='--allow-other-robot') as error:
-        contract.check(flown)
-    warning = contract.check(flown, allow_other_robot=True)
-    for text in (warning, str(error.value)):
-        assert all(part in text for part in named) and '\n' not in text, text
-        assert text.count(' in training') == len(named)
+    text = contract.check(flown)
+    assert all(part in text for part in named) and '\n' not in text, text
+    assert text.count(' in training') == len(named)
     with pytest.raises(ParameterError, match='action_scale'):
-        replace(contract, action_scale=[1.0] * 8).check(flown, allow_other_robot=True)
+        replace(contract, action_scale=[1.0] * 8).check(flown)
 
 
 @pytest.mark.parametrize('changes', [
@@ -105,8 +101,7 @@ def test_a_shipped_policy_of_a_version_that_covered_every_value_is_valid(name):
     assert network.contract.robot_hash == robot_hash(ROBOT)
     heavy = replace(ROBOT, mass=3.1, effects={'joint_bandwidth': {
         'kp': (0.2, 0.3, 0.3, 0.3), 'kd': 0.009}})
-    with pytest.raises(ParameterError, match='mass 3.0386 in training, 3.1 here'):
-        PolicyNetwork(f'policies/{name}.onnx', heavy)
+    assert 'mass 3.0386 in training, 3.1 here' in network.contract.check(heavy)
     trained = network.contract.trained_robot(heavy)
     assert robot_hash(replace(trained, multibody=ROBOT.multibody)) == robot_hash(ROBOT)
 

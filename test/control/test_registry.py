@@ -114,7 +114,7 @@ def test_a_class_is_found_by_module_and_by_file_under_its_own_name(module, tmp_p
 def test_parameters_and_attributes_of_a_class_are_used(module, tmp_path):
     entry = registry.find(f'{module}:Tuned')
     assert entry.name == 'my_tuned' and entry.flies_degraded
-    assert entry.make(ROBOT, ControllerOptions(allow_other_robot=True)).gain == 3.0
+    assert entry.make(ROBOT, ControllerOptions(without='all')).gain == 3.0
     (tmp_path / 'other.yaml').write_text('gain: 4.0\n')
     assert entry.make(ROBOT, ControllerOptions(parameters=tmp_path / 'other.yaml')).gain == 4.0
     (tmp_path / 'other.yaml').write_text('gian: 4.0\n')

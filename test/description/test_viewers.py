@@ -2,19 +2,26 @@
 
 import json
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+import pytest
 from rosbags.interfaces import Nodetype
 from synthetic_flights import fly
 import yaml
 
-from beetle_omni_ros.bags.bag import read_messages
+from beetle_omni_ros.bags.bag import read_bag, read_messages
 from beetle_omni_ros.bags.bag_writer import BagWriter
 from beetle_omni_ros.bags.messages import from_bytes, TYPESTORE
 from beetle_omni_ros.bags.topics import ALL
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.model.urdf import description
+from beetle_omni_ros.show import rerun_view as view
 
 VIEWERS = share_path('viewers')
 SHOWN = {'robot_description': 'std_msgs/msg/String'}       # beside the topics of a flight
@@ -58,6 +65,39 @@ def test_each_path_of_the_foxglove_layout_has_a_value():
     assert panels['3D!robot']['topics']['/robot_description']['visible']
 
 
+def test_each_plot_and_state_of_the_rerun_layout_is_a_topic():
+    for path in [*sum(view.PLOTS.values(), []), *view.STATES.values()]:
+        topic, field = split('/' + path)
+        assert TYPES[topic] == 'sensor_msgs/msg/JointState' if field else topic == path
+        if field:
+            walk(TYPES[topic], [field])
+
+
+def test_rerun_shows_the_robot_the_targets_and_the_errors_of_a_bag(tmp_path):
+    rerun = pytest.importorskip('rerun', reason='the extra rerun is not installed')
+    with BagWriter(tmp_path / 'bag', frames=True) as writer:
+        fly(writer, make_task('waypoints'), duration=12.0)
+    recording = rerun.RecordingStream(view.APPLICATION)
+    recording.save(tmp_path / 'bag.rrd', default_blueprint=view.blueprint())
+    with view.meshes():
+        view.send(read_bag(tmp_path / 'bag'), recording)
+        recording.disconnect()
+    shown = subprocess.run([sys.executable, '-m', 'rerun', 'rrd', 'print', '-v',
+                            str(tmp_path / 'bag.rrd')], capture_output=True, text=True).stdout
+    for entity, component in (
+            ('error/position', 'Scalars'), ('target', 'Transform3D'), ('tf', 'Transform3D'),
+            ('command/effort', 'Scalars'), ('supervisor/state', 'TextDocument'),
+            ('beetle_omni/visual_geometries/main_body/visual_0', 'Asset3D'),
+            ('ground_truth/odom', 'nav_msgs.msg.Odometry')):
+        assert f'/{entity}@{component}' in shown, entity
+
+
+def test_without_rerun_the_view_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'rerun', None)
+    with pytest.raises(ParameterError, match="--rerun: .*pip install 'rerun-sdk>="):
+        view.run_rerun([])
+
+
 def test_rviz_shows_topics_of_the_graph_with_a_quality_of_service_that_matches():
     content = yaml.safe_load((VIEWERS / 'beetle_omni.rviz').read_text())
     displays = content['Visualization Manager']['Displays']
@@ -79,9 +119,14 @@ def test_rviz_shows_topics_of_the_graph_with_a_quality_of_service_that_matches()
     assert seen == set(expected)
 
 
-def test_a_bag_contains_the_frames_of_all_layouts(tmp_path):
+def test_a_bag_has_encodings_of_all_viewers_and_frames_of_all_layouts(tmp_path):
     with BagWriter(tmp_path / 'bag', frames=True) as writer:
         fly(writer, make_task('waypoints'), duration=2.0)
+    file, = (tmp_path / 'bag').glob('*.mcap')
+    with open(file, 'rb') as source:
+        for schema, channel, *_ in make_reader(source, decoder_factories=[
+                DecoderFactory()]).iter_decoded_messages():
+            assert (channel.message_encoding, schema.encoding) == ('cdr', 'ros2msg')
     parents = {}
     for message in read_messages(tmp_path / 'bag'):
         if message.topic in ('/tf', '/tf_static'):

@@ -38,7 +38,7 @@ def robot(tmp_path):
     """Servo bus, motor board, and the arguments with their ports."""
     file = tmp_path / 'bus.yaml'
     file.write_text(PATIENT)
-    with EmulatedServoBus() as bus, EmulatedMotorBoard(parameters=QUICK) as board:
+    with EmulatedServoBus() as bus, EmulatedMotorBoard(**QUICK) as board:
         yield bus, board, ['check', '--servo-bus', str(file), '--servo-port', bus.port,
                            '--board-port', board.port, '--seconds', '1']
 

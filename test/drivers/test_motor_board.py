@@ -1,4 +1,4 @@
-"""The driver against the emulated board, over a pseudo-terminal, also with its faults."""
+"""The driver against the emulated board, in Python and in C, over a pseudo-terminal."""
 
 import os
 import pty
@@ -13,23 +13,28 @@ pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
 from board_bench import connected, driver, flying, HOVER, opened, QUICK, until
+from c_board import CFirmware
 
-from beetle_omni_ros.drivers.mavlink import common
+from beetle_omni_ros.drivers import mavlink
+from beetle_omni_ros.sim.emulated.motor_board import BoardFirmware, EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
 
 
-def test_refused_arming_is_reported_with_the_reason():
+@pytest.fixture(autouse=True, params=[BoardFirmware, CFirmware])
+def firmware(request, monkeypatch):
+    monkeypatch.setattr(EmulatedMotorBoard, 'firmware_type', request.param)
+
+
+def test_refused_arming_is_reported_with_the_reason(monkeypatch):
     with connected() as (emulated, board):
         emulated.set_battery(20.0, 0.0)
         assert until(lambda: 'battery low' in board.state.status.conditions)
         assert board.start(True).wait().reason == 'refused by the board: battery low'
         emulated.set_battery(25.0, 0.0)
         assert board.start(True).wait().accepted and emulated.armed
-        emulated.firmware._heartbeat = lambda state, now: common.MAVLink_heartbeat_message(
-            2, 0, 1, 1 | 9 << 24, 3, 3)
-        assert until(lambda: board.state.status.contract == 9)
-        assert board.start(True).wait().reason == 'firmware follows contract 9, this driver 1'
+        monkeypatch.setattr(mavlink, 'CONTRACT_VERSION', 9)
+        assert board.start(True).wait().reason == 'firmware follows contract 1, this driver 9'
 
 
 def test_an_independent_parser_accepts_all_output_of_the_driver():

@@ -3,6 +3,7 @@
 from dataclasses import replace
 import io
 import json
+import re
 import resource
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import beetle_omni_ros
 from beetle_omni_ros import cli
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.bags.metrics import metrics
@@ -144,21 +146,29 @@ def interruptible():
 
 
 def test_ctrl_c_keeps_what_was_flown_and_marks_it(poses, tmp_path, capsys, interruptible):
-    result = tmp_path / 'result.json'
+    result, bags = tmp_path / 'result.json', tmp_path / 'bags'
     stops = own(tmp_path, """if target.position[2] == 1.1 and state.position[0] > 0.2:
     target.position[2] = 1.2    # once
     os.kill(os.getpid(), signal.SIGINT)""")
-    assert run(result, f'hover,{stops}', poses, '--bag', str(tmp_path / 'bags')) == 130
+    assert run(result, f'hover,{stops}', poses, '--bag', str(bags)) == 130
     printed = capsys.readouterr()
-    assert f"interrupted; kept {tmp_path / 'bags'}" in printed.out.replace('\n', '')
+    assert re.search(r'poses reached +1 of 1 +0 of 0 *\n', printed.out)
+    assert printed.out.splitlines()[-6:-2] == [
+        'interrupted; kept what was flown',
+        *(f'files: {file}' for file in (bags / 'hover', bags / 'own', result))]
     assert printed.err == 'beetle_omni: error: interrupted\n'
-    first, second = (read_bag(tmp_path / 'bags' / name) for name in ('hover', 'own'))
+    first, second = (read_bag(bags / name) for name in ('hover', 'own'))
     assert not (first.warnings or second.warnings)
     assert 'interrupted' not in first.meta and second.meta['interrupted']
     results = json.loads(result.read_text())
     assert results['meta']['interrupted'] and results['hover']['success_rate'] == 1
     for of in (results['own'], metrics(second, make_task(str(poses)))):
         assert of['poses'] == [] and of['ended'].startswith('interrupted at ')
+    page = beetle_omni_ros.read_run(bags / 'own').report(tmp_path / 'page.html').read_text()
+    assert of['ended'] in page
+    with pytest.raises(KeyboardInterrupt):
+        beetle_omni_ros.simulate(stops, str(poses), bag=tmp_path / 'bag')
+    assert read_bag(tmp_path / 'bag').meta['interrupted']
 
 
 def test_a_full_disk_is_one_line_and_what_was_written_is_readable(poses, tmp_path):

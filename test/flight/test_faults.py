@@ -146,7 +146,7 @@ def test_the_command_writes_its_files_and_a_campaign_continues(tmp_path, monkeyp
     assert [len(one) for one in flights[-2:]] == [2, 2]
     assert json.loads((tmp_path / 'faults.json').read_text())['summary']['total']['good'] == 2
     assert '| gust |' in (tmp_path / 'faults.md').read_text()
-    assert f"page: {tmp_path / 'faults.html'}\n" in console.file.getvalue()
+    assert f"files: {tmp_path / 'faults.html'}\n" in console.file.getvalue()
 
 
 # --- outcome of a flight from the truth ----------------------------------------------------------

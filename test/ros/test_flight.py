@@ -8,6 +8,7 @@ time. The robot is observed through ground_truth/odom, which does not depend on 
 from contextlib import contextmanager
 import os
 from pathlib import Path
+import re
 import resource
 import signal
 import subprocess
@@ -130,9 +131,10 @@ def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
             process.send_signal(signal.SIGTERM)
             time.sleep(0.1)
         printed, error = process.communicate(timeout=60)
-    first, *_, last = printed.splitlines()
+    first, *lines = printed.splitlines()
     assert first.startswith('to watch: beetle_omni view --domain-id ')
-    assert last == f'interrupted; kept {bag}' and 'interrupted at ' in printed
+    assert 'interrupted at ' in printed and lines[-5:-2] == [
+        'interrupted; kept what was flown', f'files: {bag}', f"files: {bag / 'nodes.log'}"]
     assert error == 'beetle_omni: error: interrupted\n'
     assert process.returncode == 130
     log = read_bag(bag)
@@ -176,13 +178,14 @@ def test_a_fall_in_the_landing_is_the_last_line_with_its_likely_cause(tmp_path, 
         return '', '; this computer was too slow'
 
     monkeypatch.setattr(fly_module, '_fly', flown)
-    assert fly_module.run_fly(task='random1', bag=bag, standby=False) == (speed > 1)
+    assert fly_module.run_fly(task='random1', bag=bag, clock='system', standby=False) \
+        == (speed > 1)
     out, err = capfd.readouterr()
     if speed > 1:
         assert err == ('beetle_omni fly: error: the robot fell in the landing; this computer was '
                        'too slow\n')
     else:
-        assert not err and out.splitlines()[-1] == 'this computer was too slow'
+        assert not err and '\nthis computer was too slow\nfiles: ' in out
     assert 'landing [m/s]' in out
 
 
@@ -203,5 +206,8 @@ def test_a_full_disk_ends_the_flight_with_one_line_and_the_bag_is_readable(tmp_p
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)))
     assert done.returncode == 1
     assert done.stderr == f'beetle_omni fly: error: {bag}: File too large\n'
-    assert len(done.stdout.splitlines()) == 1       # how to watch it
+    assert [line.partition(':')[0] for line in done.stdout.splitlines()] == [
+        'to watch', 'files', 'files', 'next', 'next']
+    times = re.findall(r'^\[\w+\] \[([0-9.]+)\]', (bag / 'nodes.log').read_text(), re.MULTILINE)
+    assert len(times) > 9 and times == sorted(times)
     assert len(read_bag(bag).truth.t) > 100

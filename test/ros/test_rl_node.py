@@ -18,7 +18,8 @@ def test_the_executable_flies_the_given_policy(make, tmp_path):
     assert node.component._controller_status()[2]['policy'] == 'rl'
 
 
-def test_files_reach_their_nodes_and_a_shipped_policy_that_does_not_fit_is_left_out(tmp_path):
+def test_files_reach_their_nodes_and_a_shipped_policy_that_cannot_fly_is_left_out(
+        tmp_path, monkeypatch):
     policy = str(write(tmp_path / 'policy.onnx'))
     other = {'robot_file': str(share_path('params/robot_weak_and_heavy.yaml'))}
     nmpc = tmp_path / 'nmpc.yaml'
@@ -26,15 +27,15 @@ def test_files_reach_their_nodes_and_a_shipped_policy_that_does_not_fit_is_left_
     nodes, _ = controller_nodes('nmpc', {}, policy=policy, nmpc=str(nmpc))
     assert list(nodes) == ['nmpc_node', 'rl_node']
     assert nodes['nmpc_node'] == {'nmpc_file': str(nmpc)}
-    nodes, reason = controller_nodes('nmpc', other)
-    assert list(nodes) == ['nmpc_node'] and 'mass' in reason['rl']
-    nodes, reason = controller_nodes('nmpc', other, policy=policy, allow_other_robot=True)
-    assert nodes['rl_node'] == {**other, 'policy': policy, 'allow_other_robot': True}
+    nodes, _ = controller_nodes('nmpc', other, policy=policy)
+    assert nodes['rl_node'] == {**other, 'policy': policy}
     # A policy that the user names is refused, also on standby, instead of being left out.
     for active, robot, file, reason in (
             ('rl', {}, 'none.onnx', 'no such file'), ('nmpc', {}, 'none.onnx', 'no such file'),
-            ('nmpc', other, policy, 'mass')):
+            ('nmpc', {}, nmpc, 'checksum')):
         with pytest.raises(ParameterError, match=reason):
             controller_nodes(active, robot, policy=str(tmp_path / file))
     with pytest.raises(ParameterError, match="--policy .*: for the controller 'rl', which does"):
         controller_nodes('nmpc', {}, policy=policy, standby=False)
+    monkeypatch.setattr('beetle_omni_ros.ros.graph.unfit', lambda *_: 'no onnxruntime')
+    assert controller_nodes('nmpc', {}) == ({'nmpc_node': {}}, {'rl': 'no onnxruntime'})

@@ -73,7 +73,7 @@ def test_the_bridge_arms_at_takeoff_follows_thrusts_and_disarms_with_the_supervi
 def repeats_commands_until_they_are_old(flying):
     board, operator, arrivals = flying.board, flying.operator, []
     operator.period = 0.06
-    board.on_target = lambda now, stamp: arrivals.append((now, stamp))
+    board.firmware.on_target = lambda now, stamp: arrivals.append((now, stamp))
     operator.until(lambda: len(arrivals) > 60)
     stamps = [stamp for _, stamp in arrivals]
     assert stamps == sorted(stamps) and len(stamps) > 3 * len(set(stamps))
@@ -94,7 +94,7 @@ def test_after_a_killed_bridge_no_rotor_turns_and_a_new_one_does_not_arm(tmp_pat
     with bench(tmp_path) as made:
         board, operator, arrivals = made.board, made.operator, []
         made.take_off()
-        board.on_target = lambda now, stamp: arrivals.append(now)
+        board.firmware.on_target = lambda now, stamp: arrivals.append(now)
         operator.until(lambda: arrivals)
         made.graph.kill(ROTOR)
         looked, turning = time.monotonic(), 0.0

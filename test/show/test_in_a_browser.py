@@ -108,6 +108,8 @@ def test_a_page_is_complete_without_errors(chromium, made, tmp_path):
         if made is report:
             shown.locator('.main-svg').first.wait_for(timeout=60_000)
             assert shown.locator('.plot-container').count() == 1
+            assert shown.evaluate("[...document.querySelectorAll('section > figure .scroll')]"
+                                  '.every(table => table.scrollWidth <= table.clientWidth)')
         assert shown.evaluate('document.documentElement.scrollWidth') == width
         assert shown.locator('section').count() >= 1 and not shown.evaluate(CUT_OFF)
     assert not wrong

@@ -10,6 +10,7 @@ from beetle_omni_ros.bags.log import LogRecorder
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.parameters import JOINT_NAMES
+from beetle_omni_ros.show.figures import COLOURS
 from beetle_omni_ros.show.live import draw
 from beetle_omni_ros.show.recorded import recorded_scene
 from beetle_omni_ros.show.scene import close, moments, NEWTON_PER_METRE, Room, serve
@@ -37,11 +38,15 @@ def test_moments_agree_with_the_log(log):
 def test_the_drawn_robot_tilts_and_its_arrows_are_as_long_as_the_thrusts(log):
     server = serve('127.0.0.1', 8300)
     try:
-        room = Room(server, 2)
+        room = Room(server, COLOURS[:2])
         moment, = moments(log, np.array([55.0]))
         moment.tilt, moment.thrust = np.array([0.3, -1.2, 2.5, 0.0]), np.array([8.0, 4.0, 0.0, 1])
-        room.show([moment, None], ['here', ''])
+        room.show([moment, None], 'here')
         drawn, hidden = room.robots
+        np.testing.assert_allclose(room._world.position, -moment.position)
+        moment.position = moment.position + 1.0
+        room.show([moment, None], 'here', follow=False)
+        np.testing.assert_allclose(room._world.position, 1.0 - moment.position)
         assert drawn._root.visible and not hidden._root.visible
         for k, name in enumerate(JOINT_NAMES):
             link, node = drawn._joints[name]
@@ -56,7 +61,8 @@ def test_the_drawn_robot_tilts_and_its_arrows_are_as_long_as_the_thrusts(log):
 
 def test_a_recorded_scene_refers_to_nothing_outside(log):
     scene = recorded_scene({'a</script>': log})
-    assert '__VISER_EMBED_DATA__="' in scene and 'a</script>' not in scene
+    assert '__VISER_EMBED_DATA__="' in scene
+    assert 'a</script>' not in scene and 'a&lt;/script&gt;' in scene
     assert len(scene) < 2e6
 
 
@@ -71,7 +77,9 @@ def test_a_running_graph_is_drawn_until_ctrl_c():
     try:
         with pytest.raises(KeyboardInterrupt):
             draw(server, SimpleNamespace(take=take))
-        robot = server.scene._handle_from_node_name['/robot0']
+        robot = server.scene._handle_from_node_name['/world/robot0']
         assert robot.visible and robot.position[0] == pytest.approx(0.5)
+        path = server.scene._handle_from_node_name['/world/path0'].points
+        np.testing.assert_allclose(path[-1], [[0.5, 0, 1], [0.5, 0, 1]])
     finally:
         close(server)

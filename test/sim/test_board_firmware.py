@@ -1,43 +1,66 @@
-"""The state machine of the emulated firmware against the protocol, without port or clock."""
+"""Both firmwares, in Python and in C, against the protocol and each other, without clock."""
 
-from hypothesis import given, settings, strategies
+from dataclasses import replace
+
+from hypothesis import example, given, settings, strategies
+import numpy as np
 import pytest
+import reference_packets as reference
 
 pytest.importorskip('pymavlink')
 
-from beetle_omni_ros.drivers.mavlink import common
+from c_board import CFirmware, FIRMWARES, KINDS, library, make, NEEDS_COMPILER
+
+from beetle_omni_ros.drivers.mavlink import BOARD, common, HOST, MavlinkReceiver
+from beetle_omni_ros.flight.evaluate import run_evaluate
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.thrust_map import duty_of_command, ThrustMap
 from beetle_omni_ros.sim.emulated import motor_board as firmware
-from beetle_omni_ros.sim.emulated.motor_board import BoardFirmware, NUMBERS
+from beetle_omni_ros.sim.emulated.motor_board import NUMBERS
+from beetle_omni_ros.sim.simulator import Simulator
 
 BOOTED = 100.0
 
 
 class Bench:
-    """A board and functions that send messages to it."""
+    """A board and functions that send messages to it as bytes."""
 
-    def __init__(self, voltage=25.0):
+    def __init__(self, kind, **changes):
         self.now = BOOTED
-        self.board = BoardFirmware(6, BOOTED - NUMBERS['boot_time'])
-        self.board.voltage, self.board.current = voltage, 1.0
+        self.board = kind(6, BOOTED - NUMBERS['boot_time'], **changes)
+        self.board.voltage, self.board.current = 25.0, 1.0
+        self.board.rpm = [5000.0] * 4
+        self.stamp, self.heard = 0, []
+        self.packer, self._receiver = common.MAVLink(None, *HOST), MavlinkReceiver(*BOARD)
 
     def wait(self, seconds):
         self.now += seconds
 
-    def beat(self):
-        self.board.receive(common.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), self.now)
+    def feed(self, data=b''):
+        """Messages of the board after these bytes, by name; the last one of each."""
+        messages = [message for frame in self.board.serve(data, self.now)
+                    for message in self._receiver.feed(frame)]
+        self.heard += messages
+        return {message.get_type(): message for message in messages}
 
-    def stamp(self, age=0.0):
-        return round(1e6 * (self.board.clock(self.now) - age))
+    def send(self, message):
+        frame = message.pack(self.packer)
+        self.packer.seq = (self.packer.seq + 1) % 256
+        return self.feed(frame)
+
+    def beat(self):
+        self.send(common.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
 
     def target(self, *commands, age=0.0, stamp=None, group=0, to=(1, 1)):
-        stamp = self.stamp(age) if stamp is None else stamp
-        self.board.receive(common.MAVLink_set_actuator_control_target_message(
-            stamp, group, *to, [*commands, *[0.0] * (8 - len(commands))]), self.now)
+        now = max(0, round(1e6 * (self.board.clock(self.now) - age)))
+        self.stamp = now if stamp is None else stamp
+        return self.send(common.MAVLink_set_actuator_control_target_message(
+            self.stamp, group, *to, [*commands, *[0.0] * (8 - len(commands))]))
 
     def command(self, arm, force=0.0, number=400, to=(1, 1)):
-        answers = self.board.receive(common.MAVLink_command_long_message(
-            *to, number, 0, arm, force, 0, 0, 0, 0, 0), self.now)
-        return (answers[0].result, answers[0].result_param2) if answers else None
+        answer = self.send(common.MAVLink_command_long_message(
+            *to, number, 0, arm, force, 0, 0, 0, 0, 0)).get('COMMAND_ACK')
+        return answer and (answer.result, answer.result_param2)
 
     def arm(self):
         self.beat()
@@ -59,8 +82,12 @@ class Bench:
         return detail >> 8
 
 
-def test_targets_are_ignored_until_armed_and_followed_then():
-    bench = Bench()
+@pytest.fixture(params=FIRMWARES)
+def bench(request):
+    return Bench(request.param)
+
+
+def test_targets_are_ignored_until_armed_and_followed_then(bench):
     bench.beat()
     bench.target(0.5, 0.5, 0.5, 0.5)
     assert bench.outputs == firmware.STOP
@@ -78,9 +105,8 @@ def test_targets_are_ignored_until_armed_and_followed_then():
     assert bench.board.conditions(bench.now) & firmware.SATURATED
 
 
-def test_rotors_stop_100_ms_after_the_last_target_and_start_again_with_the_next():
-    bench = Bench().arm()
-    bench.target(0.5)
+def test_rotors_stop_100_ms_after_the_last_target_and_start_again_with_the_next(bench):
+    bench.arm().target(0.5)
     bench.wait(0.0999)
     assert bench.outputs[0] == 0.5
     bench.wait(0.0002)
@@ -88,7 +114,7 @@ def test_rotors_stop_100_ms_after_the_last_target_and_start_again_with_the_next(
     assert bench.board.conditions(bench.now) & firmware.TIMED_OUT
     bench.target(0.4)
     assert bench.outputs[0] == 0.4
-    stamp = bench.stamp()
+    stamp = bench.stamp + 1000
     for _ in range(20):     # the first is new, the repetitions do not keep the rotors alive
         bench.target(0.5, stamp=stamp)
         assert bench.outputs[0] == 0.5
@@ -105,41 +131,125 @@ def test_rotors_stop_100_ms_after_the_last_target_and_start_again_with_the_next(
     ('more than four rotors', lambda bench: bench.target(0.1, 0.1, 0.1, 0.1, 0.1)),
     ('other group', lambda bench: bench.target(0.5, group=1)),
     ('other addressee', lambda bench: bench.target(0.5, to=(1, 2)))])
-def test_bad_targets_are_refused_and_counted(reason, make):
-    bench = Bench().arm()
-    make(bench)
+def test_bad_targets_are_refused_and_counted(bench, reason, make):
+    make(bench.arm())
     assert bench.outputs == firmware.STOP
     assert bench.board.refused == {reason: 1}
+    bench.wait(1.0)
+    assert bench.feed()['SYS_STATUS'].errors_count3 == 1
 
 
-ACTIONS = strategies.sampled_from(['beat', 'arm', 'disarm', 'thrust', 'zero', 'old', 'nan',
-                                   'reboot', 'esc', 'low'])
+def test_the_documented_frames_are_obeyed_also_after_noise_and_damaged_frames(bench):
+    bench.board.reboot(bench.now)
+    bench.wait(1.234567)
+    assert [message.custom_mode for message in bench.feed().values()] == [0x01030400]     # boot
+    signed, long = bytearray(reference.DISARM), bytearray(reference.DISARM)
+    long[1] += 30           # must not hide the frames behind it
+    signed[2] = 1           # with a valid checksum
+    signed[-2:] = reference.crc(signed[1:-2] + bytes([152])).to_bytes(2, 'little')
+    answers = bench.feed(b'noise\xfd' + reference.HOST_HEARTBEAT + reference.ARM + long
+                         + reference.TARGET + signed + bytes(13) + reference.TIME_REQUEST
+                         + bytes(300))      # longer than a frame
+    assert answers['COMMAND_ACK'].result_param2 == 1
+    assert answers['TIMESYNC'].ts1 == 0x0102030405060708
+    assert answers['TIMESYNC'].tc1 == pytest.approx(1.234567e9, rel=1e-4)
+    assert bench.outputs == (0.5, 0.25, 1.0, 0.0)
+
+
+ACTIONS = {
+    'beat': Bench.beat, 'arm': lambda b: b.command(1.0), 'disarm': lambda b: b.command(0.0),
+    'force': lambda b: b.command(1.0, 1.0), 'other': lambda b: b.command(1.0, number=511),
+    'time': lambda b: b.send(common.MAVLink_timesync_message(0, 7)),
+    'answer': lambda b: b.send(common.MAVLink_timesync_message(1, 7)),
+    'thrust': lambda b: b.target(0.5), 'zero': lambda b: b.target(0.0),
+    'clipped': lambda b: b.target(1.5, -0.5, 0.25, 0.7), 'old': lambda b: b.target(0.5, age=0.2),
+    'ahead': lambda b: b.target(0.5, age=-0.04), 'again': lambda b: b.target(0.6, stamp=b.stamp),
+    'nan': lambda b: b.target(float('nan'), stamp=0), 'cut': lambda b: b.feed(reference.ARM[:-4]),
+    'damaged': lambda b: b.feed(reference.ARM[:-1] + b'a'), 'noise': lambda b: b.feed(b'\xfe\xfd'),
+    'lost': lambda b: setattr(b.packer, 'seq', b.packer.seq ^ 8),
+    'reboot': lambda b: (b.board.reboot(b.now), setattr(b, 'stamp', 0)),
+    'esc': lambda b: (setattr(b.board, 'failed', b.board.failed ^ {1}), b.wait(0.110007)),
+    'low': lambda b: setattr(b.board, 'voltage', 44.0 - b.board.voltage)}
+DIFFERENT = {'counter', 'error_count', 'tc1'}   # packets of ESCs; C counts microseconds
 
 
 @settings(max_examples=300, deadline=None)
-@given(strategies.lists(strategies.tuples(ACTIONS, strategies.sampled_from(
-    [0.0, 0.004, 0.05, 0.099, 0.3, 1.2])), max_size=60))
-def test_no_sequence_of_events_turns_rotors_without_arming_or_a_fresh_target(events):
-    bench, last_thrust, disarmed = Bench(), -1.0, True
-    for action, pause in events:
-        if action == 'beat':
+@given(events=strategies.lists(strategies.tuples(   # no sum of pauses is a limit of the contract
+    strategies.sampled_from(list(ACTIONS)), strategies.sampled_from(
+        [0.0, 0.004007, 0.030007, 0.050007, 0.099007, 0.300007, 1.200007])), max_size=60))
+@example(events=[('ahead', 0.110007), ('again', 0.0)])     # too late for the rotors
+def test_boards_agree_on_any_events_and_rotors_turn_only_if_armed_and_by_fresh_targets(events):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(firmware, 'CLOCK_DRIFT', 0.0)
+        benches = [Bench(kind, idle_timeout=0.4) for kind in KINDS]
+        last_target, disarmed = -1.0, True
+        for action, pause in [('beat', 0.004007), ('arm', 0.0), *events]:
+            results = []
+            for bench in benches:
+                bench.heard.clear()
+                answer = ACTIONS[action](bench)
+                bench.wait(pause)
+                results.append([bench.state, bench.outputs, [*bench.feed()], bench.board.refused,
+                                bench.board.timeouts, *(
+                    (field, getattr(message, field)) for message in bench.heard
+                    for field in message.fieldnames if field not in DIFFERENT)])
+            assert results[1:] == results[:-1]
+            if action == 'reboot' or action in ('arm', 'disarm') and answer \
+                    and answer[0] == firmware.ACCEPTED:
+                disarmed = action != 'arm'
+            if action in ('thrust', 'zero', 'clipped', 'ahead'):
+                last_target = bench.now - pause
+            if any(bench.outputs):
+                assert not disarmed
+                assert bench.now - last_target < NUMBERS['target_timeout'] + 1e-9
+
+
+@NEEDS_COMPILER
+def test_flights_with_both_boards_have_equal_tables(monkeypatch):
+    """In simulated time: each thrust passes as bytes through a board; all digits are equal."""
+    thrust_map, results, direct = ThrustMap(RobotParameters.load().rotors), [], Simulator.command
+    for bench in map(Bench, KINDS):
+
+        def command(simulator, wanted, bench=bench):
+            voltage, bench.now = simulator.battery.voltage, BOOTED + simulator.time
             bench.beat()
-        elif action in ('arm', 'disarm'):
-            answer = bench.command(float(action == 'arm'))
-            if answer and answer[0] == firmware.ACCEPTED:
-                disarmed = action == 'disarm'
-        elif action == 'reboot':
-            bench.board.reboot(bench.now)
-            disarmed = True
-        elif action == 'esc':
-            bench.board.failed ^= {1}
-        elif action == 'low':
-            bench.board.voltage = 44.0 - bench.board.voltage
-        else:
-            bench.target({'thrust': 0.5, 'old': 0.5, 'zero': 0.0, 'nan': float('nan')}[action],
-                         age=0.2 * (action == 'old'))
-            last_thrust = bench.now if action == 'thrust' else last_thrust
-        bench.wait(pause)
-        if any(bench.outputs):
-            assert not disarmed
-            assert bench.now - last_thrust < NUMBERS['target_timeout'] + 1e-9
+            if bench.state == firmware.DISARMED:
+                bench.arm()
+            bench.target(*thrust_map.command(wanted.thrust, voltage))
+            direct(simulator, replace(wanted, thrust=thrust_map.thrust(
+                duty_of_command(np.array(bench.outputs)), voltage)))
+
+        monkeypatch.setattr(Simulator, 'command', command)
+        results.append(run_evaluate(controllers=['hover'], task='random1')['hover'])
+        assert results[-1].pop('compute_ms') and results[-1]['success_rate'] == 1.0
+        assert not bench.board.refused and not bench.board.timeouts
+    assert results[0] == results[1]
+
+
+@NEEDS_COMPILER
+@pytest.mark.parametrize(('failed', 'rpm', 'after', 'flags'), [
+    ({2}, 5000, 0.1, 64), (set(), 0, 0.2, 32)], ids=['silent', 'standing'])
+def test_a_lost_esc_is_reported_in_time_and_stops_no_other_rotor(failed, rpm, after, flags):
+    bench = Bench(CFirmware).arm()
+    bench.board.failed, bench.board.rpm[2] = failed, rpm
+    while bench.now < BOOTED + after - 1e-6:
+        assert 'ESC_INFO' not in bench.target(0.5, 0.5, 0.5, 0.5)
+        bench.wait(0.01)
+    info = bench.feed()['ESC_INFO']
+    assert (info.info, info.failure_flags[2], info.temperature[2]) == (0b1011, flags, 32767)
+    assert bench.outputs == (0.5,) * 4
+
+
+@NEEDS_COMPILER
+def test_its_numbers_are_those_of_the_contract_and_dshot_frames_have_a_checksum():
+    numbers = CFirmware(6, BOOTED).numbers
+    assert [*type(numbers).in_dll(library(), 'mb_contract')] == [*numbers]
+    frames = [library().mb_dshot(1_000_000 + pulse, telemetry) & 0xFFFF for pulse, telemetry in (
+        (499_250, False), (0, False), (0, True), (1_000_000, False), (1, False))]
+    assert frames == [0x82C6, 0, 0x11, 0xFFEE, 0x606]   # the first: 1046, the usual example
+
+
+@NEEDS_COMPILER
+def test_random_events_execute_every_line_and_violate_no_property_under_sanitizers():
+    assert 'Lines executed:100.00%' in make('coverage')
+    assert make('fuzz', 'SECONDS=5')

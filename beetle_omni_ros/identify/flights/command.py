@@ -30,7 +30,7 @@ from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_
 from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.show.page import print_grids, Terminal
+from beetle_omni_ros.show.page import print_end, print_grids, Terminal
 
 BAD_DATA = 3        # exit status
 LEAST_FITTED = 2    # bags; with more, the last one is held out if none is given
@@ -105,7 +105,11 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
         write_text(page, html, 'page')
     if apply and result['effects']:
         write_corrected(apply, result, model, robot, tolerances)
-    _print(console, result, apply)
+    _print(console, result)
+    written = apply if result['effects'] else None
+    print_end(console, (written, page, json_path), ('evaluate', '--robot', written) if written
+              else 'no robot file, because no effect is named' if apply else
+              'the same with --report FILE writes a page, with --apply FILE a robot file')
     return result
 
 
@@ -149,7 +153,7 @@ def _damaged(result, given):
     return read_recording(given[names_of(given).index(first['run'])]), first
 
 
-def _print(console, result, apply):
+def _print(console, result):
     console.print(headline(result), style='bold', highlight=False, markup=False)
     console.print(result['summary'], highlight=False, markup=False)
     for finding in dict.fromkeys(result['findings']):
@@ -160,6 +164,3 @@ def _print(console, result, apply):
     if result['next_flight']:
         console.print(f"Next flight: {result['next_flight']['sentence']}", highlight=False,
                       markup=False, soft_wrap=True)
-    if apply:
-        console.print(f'corrected robot: {apply}' if result['effects'] else
-                      'no effect is named: no robot file is written', highlight=False)

@@ -11,7 +11,7 @@ import numpy as np
 from beetle_omni_ros.identify.recording.bag import Recording
 from beetle_omni_ros.identify.recording.topics import begin_of
 from beetle_omni_ros.model.effects import CATALOGUE
-from beetle_omni_ros.show.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
+from beetle_omni_ros.show import figures
 from beetle_omni_ros.show.page import ABSENT, Grid, html, page, section, verdict_head
 
 WORDS = {'no_gap': 'no gap', 'named': 'named', 'named_set': 'one of a set',
@@ -22,9 +22,9 @@ LOPSIDED = 0.2          # asymmetry of an interval from which a sentence states 
 SPELLED = {'imu': 'IMU', 'mocap': 'MoCap'}
 SHOWN = 6               # channels and candidates in the terminal
 LEAST_CHANCE = 1e-6     # below, a probability is not stated as a number
-BEFORE, AFTER = COLOURS[1], COLOURS[0]
-VERDICT_COLOURS = {'no_gap': '#2b7a3d', 'named': '#1f5fa8', 'named_set': '#1f5fa8',
-                   'unknown': '#b06a00', 'not_decidable': '#b06a00', 'bad_data': '#b3261e'}
+VERDICT_COLOURS = {'no_gap': figures.GREEN, 'bad_data': figures.RED,
+                   **dict.fromkeys(('named', 'named_set'), figures.BLUE),
+                   **dict.fromkeys(('unknown', 'not_decidable'), figures.AMBER)}
 # Topic -> label of an axis -> names of its readings.
 LABELS = {
     'imu/data_raw': {'force [m/s^2]': 'xyz', 'rate [rad/s]': 'xyz'},
@@ -274,8 +274,8 @@ def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str
             section('Tolerances', 'Deviations of this robot from the robot file, as fitted and '
                     'not named; --tolerances writes masses, gains, lags and rotor positions to '
                     'the robot file.', html(_tolerances(result)))]
-    with matplotlib.rc_context(STYLE):
-        picture = svg(_damage(*damaged), 'damaged readings') if damaged else svg(
+    with matplotlib.rc_context(figures.STYLE):
+        picture = figures.svg(_damage(*damaged), 'damaged readings') if damaged else figures.svg(
             picture_of(result), 'disagreement and sizes') if result['where'] else ''
     return page('Gap', _about(result['meta']), grids(result, brief=False), notes, sections,
                 head(result, picture))
@@ -298,15 +298,16 @@ def picture_of(result: dict) -> Figure:
     """Disagreement by channel before and after, and the sizes of the effects with intervals."""
     sizes = _sizes(result['effects'] or result['partial'])
     rows = sorted(whole(result), key=lambda row: row['channel'])[::-1]
-    figure, axes = panels(1, 2 if sizes else 1, height=HEIGHT * max(len(rows), len(sizes)) + 0.6)
+    height = HEIGHT * max(len(rows), len(sizes)) + 0.6
+    figure, axes = figures.panels(1, 2 if sizes else 1, height=height)
     place = np.arange(len(rows))
-    for key, shift, colour, text in (('excess', 0.18, BEFORE, 'robot file'),
-                                     ('excess_after', -0.18, AFTER, 'fit')):
+    for key, shift, colour, text in (('excess', 0.18, figures.BEFORE, 'robot file'),
+                                     ('excess_after', -0.18, figures.AFTER, 'fit')):
         axes[0, 0].barh(place + shift, [row[key] for row in rows], 0.36, color=colour, label=text)
-    axes[0, 0].axvline(1.0, color=FAINT, ls='--', lw=0.9, label='noise')
+    axes[0, 0].axvline(1.0, color=figures.FAINT, ls='--', lw=0.9, label='noise')
     axes[0, 0].set_yticks(place, [row['channel'] for row in rows])
     axes[0, 0].set_xlabel('RMS of measured minus expected, over the noise')
-    legend(figure, axes[0, 0])
+    figures.legend(figure, axes[0, 0])
     if sizes:
         _draw(axes[0, 1], sizes[::-1])
     return figure
@@ -314,9 +315,9 @@ def picture_of(result: dict) -> Figure:
 
 def _draw(axis, sizes):
     for k, (_, middle, low, high) in enumerate(sizes):
-        axis.plot([low, high], [k, k], color=INK, lw=1.4)
-        axis.plot(middle, k, 'o', color=AFTER, ms=4)
-    axis.axvline(0.0, color=BEFORE, lw=0.9)
+        axis.plot([low, high], [k, k], color=figures.INK, lw=1.4)
+        axis.plot(middle, k, 'o', color=figures.AFTER, ms=4)
+    axis.axvline(0.0, color=figures.BEFORE, lw=0.9)
     axis.set_yticks(np.arange(len(sizes)), [text for text, *_ in sizes])
     axis.set_xlabel('deviation in typical sizes, 95 %')
 
@@ -345,15 +346,15 @@ def _damage(recording, damage):
     """Figure of the readings of the damaged topic; a dashed line marks the onset."""
     topic = damage['topic'] if damage['topic'] in LABELS else 'imu/data_raw'
     t, values = recording.times[topic] - begin_of(recording), recording.values[topic]
-    figure, axes = panels(len(LABELS[topic]), 1, height=1.1, sharex=True)
+    figure, axes = figures.panels(len(LABELS[topic]), 1, height=1.1, sharex=True)
     first = 0
     for axis, (label_of, names) in zip(axes[:, 0], LABELS[topic].items(), strict=True):
         for k, name in enumerate(names):
-            axis.plot(t, values[:, first + k], lw=0.8, color=COLOURS[k], label=name)
+            axis.plot(t, values[:, first + k], lw=0.8, color=figures.PARTS[k], label=name)
         first += len(names)
         axis.set_ylabel(label_of)
         axis.legend(loc='upper right', ncols=4)
         if damage['at_s'] is not None:
-            axis.axvline(damage['at_s'], color=INK, ls='--', lw=1.0)
+            axis.axvline(damage['at_s'], color=figures.INK, ls='--', lw=1.0)
     axes[-1, 0].set_xlabel('stamp [s], from the first IMU message on')
     return figure

@@ -32,7 +32,7 @@ from beetle_omni_ros.identify.servo.model import (
     TERMS,
 )
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.show.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
+from beetle_omni_ros.show.figures import AFTER, BEFORE, FAINT, INK, legend, panels, STYLE, svg
 from beetle_omni_ros.show.page import Grid, section
 
 MILLI = 1e3
@@ -283,8 +283,8 @@ def _figure(log, models, robot, fitted) -> Figure:
         left.plot(t, log.command[k], color=FAINT, lw=1.0)
         left.plot(t, log.measured[k], color=INK, lw=1.4)
         left.set_ylabel(f'joint {number} [rad]')
-        for values, hold, colour, name in ((file[number - 1], is_held, COLOURS[1], 'robot file'),
-                                           (models[number], True, COLOURS[0], 'identified')):
+        for values, hold, colour, name in ((file[number - 1], is_held, BEFORE, 'robot file'),
+                                           (models[number], True, AFTER, 'identified')):
             error = MILLI * (simulate(log, k, values[None], hold)[0] - log.measured[k])
             right.plot(read, error[log.fresh], color=colour, lw=0.8, label=name)
         right.set_ylabel('error [mrad]')

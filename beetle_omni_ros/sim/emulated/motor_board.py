@@ -12,7 +12,14 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from beetle_omni_ros.drivers.mavlink import common, EscInfo, EscStatus, MavlinkReceiver
+from beetle_omni_ros.drivers.mavlink import (
+    BOARD,
+    common,
+    EscInfo,
+    EscStatus,
+    HOST,
+    MavlinkReceiver,
+)
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.thrust_map import duty_of_command, ThrustMap
 from beetle_omni_ros.sim.emulated.device import BoardFaults, Device
@@ -24,7 +31,6 @@ NONE, ASKED, HEARTBEAT_LOST, IDLE, WATCHDOG = range(5)      # reasons of the las
  SATURATED) = (1 << bit for bit in range(7))
 BLOCKS_ARMING = BOOTING | NO_HEARTBEAT | THROTTLE | BATTERY_LOW | ESC_FAILURE
 CONTRACT_VERSION = 1
-BOARD, HOST = (1, 1), (1, 191)    # MAVLink system and component of both sides
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)
 STOP = (0.0, 0.0, 0.0, 0.0)
 UNKNOWN_CELL, UNKNOWN_TEMPERATURE = 65535, 32767
@@ -32,12 +38,13 @@ GENERIC_FAILURE = 64            # ESC_FAILURE_GENERIC
 MIN_HEARTBEAT_PERIOD = 0.02     # [s]
 CLOCK_START, CLOCK_DRIFT = 4.0, 20e-6   # [s], [s/s] of the board's clock, as of a crystal
 ESC_TEMPERATURE = 35.0          # [C]
+PULSE_STEPS = 1_000_000         # of 1 ns from stop to full
 # Section 2 of the contract: times [s], voltage of a cell [V], rates of messages [Hz].
 NUMBERS = {
     'target_timeout': 0.1, 'heartbeat_timeout': 1.0, 'idle_timeout': 2.0,
     'throttle_low_time': 1.0, 'target_age_limit': 0.1, 'target_future_limit': 0.05,
-    'boot_time': 0.3, 'arm_cell_voltage': 3.5, 'heartbeat_rate': 5.0, 'rotor_info_rate': 2.0,
-    'rotor_rate': 100.0, 'battery_rate': 50.0, 'reception_rate': 1.0}
+    'boot_time': 0.3, 'arm_cell_voltage': 3.5, 'heartbeat_rate': 5.0, 'battery_rate': 50.0,
+    'rotor_rate': 100.0, 'rotor_info_rate': 2.0, 'reception_rate': 1.0}
 
 
 class BoardFirmware:
@@ -46,7 +53,11 @@ class BoardFirmware:
 
     All times are arguments on a clock without steps. Each call first advances the state to its
     time, so that the results do not depend on the frequency of calls. ``changes`` are of NUMBERS.
+    ``on_target`` is called after each target with its arrival [s] and its stamp [us], for
+    measurements.
     """
+
+    on_target: Callable[[float, int], None] | None = None
 
     def __init__(self, cells: int, now: float, **changes: float):
         self.numbers = SimpleNamespace(**NUMBERS | changes)
@@ -68,10 +79,11 @@ class BoardFirmware:
         self.refused: dict[str, int] = {}   # reason -> number of refused targets
         self.timeouts = 0                   # of targets with turning rotors
         # Rate -> time at which its message is due [s].
-        self.next = {name: self._booted_at for name in NUMBERS if name.endswith('_rate')}
+        self._next = {name: self._booted_at for name in NUMBERS if name.endswith('_rate')}
         self._sent_mode, self._sent_at = None, -math.inf
         self._sent_failed: frozenset[int] | None = None
         self._errors = [0] * 4
+        self._receiver, self._packer = MavlinkReceiver(*HOST), common.MAVLink(None, *BOARD)
 
     def reboot(self, now: float) -> None:
         """Reset by the watchdog: outputs off, initial state, clock at zero."""
@@ -87,10 +99,15 @@ class BoardFirmware:
         self._advance(now)
         return now >= self._booted_at
 
+    @property
+    def next_due(self) -> float:
+        """Time of the next periodic message [s]."""
+        return min(self._next.values())
+
     def state(self, now: float) -> int:
         """BOOT, DISARMED, ARMED (rotors stopped) or RUNNING (following targets)."""
         self._advance(now)
-        if now < self._booted_at:
+        if not self._announced:
             return BOOT
         if self._armed_at == -math.inf:
             return DISARMED
@@ -103,7 +120,7 @@ class BoardFirmware:
     def conditions(self, now: float) -> int:
         """Bits of the conditions that prevent arming, and of timed-out and saturated targets."""
         numbers, armed = self.numbers, self._armed_at > -math.inf
-        return BOOTING * (now < self._booted_at) \
+        return BOOTING * (not self._announced) \
             | NO_HEARTBEAT * (now - self._heartbeat_at >= numbers.heartbeat_timeout) \
             | THROTTLE * (not armed and
                           now - self._nonzero_target_at < numbers.throttle_low_time) \
@@ -112,10 +129,24 @@ class BoardFirmware:
             | TIMED_OUT * (armed and self._target_at > -math.inf and not self._fresh(now)) \
             | SATURATED * (self._saturated and self._fresh(now))
 
-    def receive(self, message, now: float) -> list:
-        """Handle a message of the computer; return the answers."""
+    def serve(self, data: bytes, now: float) -> list[bytes]:
+        """Handle received bytes; return the frames that are due, then the answers."""
         if not self.runs(now):
             return []
+        messages = self._due(now)   # before any answer: the first frame is a heartbeat
+        for message in self._receiver.feed(data):
+            messages += self._receive(message, now)
+            if self.on_target and message.get_type() == 'SET_ACTUATOR_CONTROL_TARGET':
+                self.on_target(now, message.time_usec)
+        return [self._pack(message) for message in messages]
+
+    def _pack(self, message):
+        frame = message.pack(self._packer)
+        self._packer.seq = (self._packer.seq + 1) % 256
+        return frame
+
+    def _receive(self, message, now):
+        """Handle a message of the computer; return the answers."""
         kind = message.get_type()
         if kind == 'HEARTBEAT':
             self._heartbeat_at = now
@@ -127,13 +158,13 @@ class BoardFirmware:
             return [self._command(message, now)]
         return []
 
-    def due(self, now: float, received: dict[str, int]) -> list:
-        """Periodic messages due at ``now``; ``received`` has the counts of the receiver."""
-        if not self.runs(now):
-            return []
+    def _due(self, now):
+        """Periodic messages due at ``now``."""
+        received = self._receiver.counts
         if not self._announced:
+            messages = [self._heartbeat(BOOT, now)]
             self._announced = True
-            return [self._heartbeat(BOOT, now)]
+            return messages
         messages, beat = [], self._heartbeat(self.state(now), now)
         changed = beat.custom_mode != self._sent_mode \
             and now - self._sent_at >= MIN_HEARTBEAT_PERIOD
@@ -168,10 +199,10 @@ class BoardFirmware:
 
     def _is_due(self, rate, now):
         """Whether a message with this rate is due: without drift, and once after a pause."""
-        if now < self.next[rate]:
+        if now < self._next[rate]:
             return False
         period = 1 / getattr(self.numbers, rate)
-        self.next[rate] += period * (1 + math.floor((now - self.next[rate]) / period))
+        self._next[rate] += period * (1 + math.floor((now - self._next[rate]) / period))
         return True
 
     def _heartbeat(self, state, now):
@@ -214,10 +245,12 @@ class BoardFirmware:
         if reason:
             self.refused[reason] = self.refused.get(reason, 0) + 1
             return
-        self._saturated = min(controls) < 0 or max(controls) > 1
-        self._target = tuple(min(1.0, max(0.0, control)) for control in controls[:4])
         if newer:       # a repeated target does not prevent the timeout
             self._target_at = now
+        if self._fresh(now):
+            self._saturated = min(controls) < 0 or max(controls) > 1
+            self._target = tuple(math.floor(PULSE_STEPS * min(1.0, max(0.0, control)) + 0.5)
+                                 / PULSE_STEPS for control in controls[:4])
 
     def _refusal(self, message, stamp, controls, now):
         age = self.clock(now) - stamp
@@ -261,19 +294,19 @@ class EmulatedMotorBoard(Device):
 
     A plant reads :attr:`thrust_targets` and sets the sensors, from any thread. Before
     :meth:`set_battery` the battery is full, and before :meth:`set_rotors` the rotors report no
-    speed. ``changes`` are of NUMBERS. ``on_target`` is called in the board's thread after each
-    target with its arrival [s, monotonic] and its stamp [us], for measurements.
+    speed. ``changes`` are of NUMBERS. ``firmware_type`` may be replaced by another firmware with
+    the methods of BoardFirmware; a test does this with the one in C of the folder firmware.
     """
+
+    firmware_type = BoardFirmware
 
     def __init__(self, robot: RobotParameters | None = None, *, seed: int = 0,
                  port: str | Path | None = None, **changes: float):
         robot = robot or RobotParameters.load()
         self._map = ThrustMap(robot.rotors)
         self.faults = BoardFaults()
-        self.on_target: Callable[[float, int], None] | None = None
-        self.firmware = BoardFirmware(robot.battery.cells, time.monotonic(), **changes)
+        self.firmware = self.firmware_type(robot.battery.cells, time.monotonic(), **changes)
         self.set_battery(robot.battery.full_voltage, 0.0)
-        self._clear_stream()
         super().__init__('motor_board', port, seed)
 
     @property
@@ -310,13 +343,9 @@ class EmulatedMotorBoard(Device):
         """Reset the board, as its watchdog does."""
         with self._lock:
             self.firmware.reboot(time.monotonic())
-            self._clear_stream()
-
-    def _clear_stream(self):
-        self._receiver, self._packer = MavlinkReceiver(*HOST), common.MAVLink(None, *BOARD)
 
     def _due(self):
-        telemetry = min(self.firmware.next.values())
+        telemetry = self.firmware.next_due
         return telemetry if telemetry > time.monotonic() else math.inf
 
     def _serve(self, now):
@@ -324,18 +353,6 @@ class EmulatedMotorBoard(Device):
         received = self._spoilt(self._read(), self.faults.drop_in, self.faults.corrupt_in)
         # Read the clock after the bytes, as a board does, because this thread may have waited.
         now = time.monotonic()
-        if not self.firmware.runs(now):
-            return
         self.firmware.failed = frozenset(int(rotor) - 1 for rotor in self.faults.failed_escs)
-        # Before any answer: the first frame after a reset is a heartbeat.
-        self._answer(self.firmware.due(now, self._receiver.counts))
-        for message in self._receiver.feed(received):
-            self._answer(self.firmware.receive(message, now))
-            if self.on_target and message.get_type() == 'SET_ACTUATOR_CONTROL_TARGET':
-                self.on_target(now, message.time_usec)
-
-    def _answer(self, messages):
-        for message in messages:
-            frame = message.pack(self._packer)
-            self._packer.seq = (self._packer.seq + 1) % 256
+        for frame in self.firmware.serve(received, now):
             self._send(self._spoilt(frame, self.faults.drop_out, self.faults.corrupt_out))
