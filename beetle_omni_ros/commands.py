@@ -294,15 +294,21 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
             'crazypad_motor, or a YAML file.'))] = None,
         alpha: Annotated[float, Option(metavar='P', help=(
             'Accepted probability of a false alarm.'))] = 0.05,
+        next_task: Annotated[Path | None, Option(
+            '--next', callback=writable, metavar='FILE', help=(
+                'Write a task (YAML) that decides between the candidates, for fly and '
+                'evaluate.'))] = None,
         json_path: JsonOption = None):
     """
     Identify and add effects that the model lacks from flights.
 
     Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
     """
+    from beetle_omni_ros.flight.experiment import Experiments
     from beetle_omni_ros.identify.flights.command import run_gap
     return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
-                   tolerances=tolerances, form=form, alpha=alpha)
+                   tolerances=tolerances, form=form, alpha=alpha, next_task=next_task,
+                   experiments=Experiments)
 
 
 app.command()(improve)

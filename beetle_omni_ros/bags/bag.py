@@ -2,25 +2,32 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from io import BytesIO
 from itertools import islice
 import json
 from pathlib import Path
+from struct import Struct
 from typing import NamedTuple
 
-from mcap.exceptions import InvalidMagic
-from mcap.reader import NonSeekingReader
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, InvalidMagic
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Schema
+from mcap.stream_reader import get_chunk_data_stream, read_magic
 import numpy as np
 
 from beetle_omni_ros.bags.conversions import from_nanoseconds
-from beetle_omni_ros.bags.log import FlightLog, LogRecorder, META_KEY
-from beetle_omni_ros.bags.messages import from_bytes
+from beetle_omni_ros.bags.log import channels_of, FlightLog, LogRecorder, META_KEY
+from beetle_omni_ros.bags.messages import columns, from_bytes
 from beetle_omni_ros.bags.topics import ALL, controller_of, TELLING, Topic, topic_of
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.model.schema import ParameterError, read_yaml
 
 BagError = ParameterError   # its name in identify
 AT_ONCE = 4096      # messages that are read together
+HEAD, FIELDS = Struct('<BQ'), Struct('<HIQQ')   # of each record of a file, and of a message
 
 
 class Recorded(NamedTuple):
@@ -119,13 +126,11 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         except OSError as error:
             raise ParameterError(f'{file}: {error.strerror}') from None
         with stream:
-            messages = NonSeekingReader(stream, validate_crcs=True).iter_messages(
-                log_time_order=False)
             try:
-                for schema, channel, message in messages:
+                read_magic(ReadDataStream(stream))
+                for topic, kind, data, received in _messages(stream, {}, {0: ''}):
                     count += 1
-                    yield Recorded(channel.topic, schema.name if schema else '', message.data,
-                                   from_nanoseconds(message.log_time))
+                    yield Recorded(topic, kind, data, from_nanoseconds(received))
             except Exception as error:  # broken bytes raise anything in the library
                 if isinstance(error, InvalidMagic) and not count:
                     raise ParameterError(f'{file}: not an MCAP file') from None
@@ -137,6 +142,31 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         readable += count
     if broken and not readable:
         raise ParameterError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
+
+
+def _messages(stream, topics, schemas, outside=True):
+    """Yield topic, type, data, time [ns] of messages; the library takes four times as long."""
+    while len(head := stream.read(HEAD.size)) == HEAD.size:
+        kind, length = HEAD.unpack(head)
+        if len(data := stream.read(length)) < length:
+            break
+        record = ReadDataStream(BytesIO(data)) if kind != Opcode.MESSAGE else None
+        if kind == Opcode.MESSAGE:
+            channel, _, received, _ = FIELDS.unpack_from(data)
+            yield *topics[channel], data[FIELDS.size:], received
+        elif kind == Opcode.CHUNK:
+            part, size = get_chunk_data_stream(Chunk.read(record), validate_crc=True)
+            yield from _messages(BytesIO(part.read(size)), topics, schemas, False)
+        elif kind == Opcode.CHANNEL:
+            channel = Channel.read(record)
+            topics[channel.id] = channel.topic, schemas[channel.schema_id]
+        elif kind == Opcode.SCHEMA:
+            schema = Schema.read(record)
+            schemas[schema.id] = schema.name
+        elif kind == Opcode.FOOTER:
+            return
+    if head or outside:
+        raise EndOfFile
 
 
 def read_together(path: str | Path, warnings: list[str] | None = None
@@ -178,6 +208,41 @@ def read_all(topic: Topic, messages: Sequence[bytes]) -> tuple[list[int], list, 
     return rows, values, refused
 
 
+def read_columns(topic: Topic, messages: Sequence[bytes], channels: dict[str, int]
+                 ) -> tuple[np.ndarray, dict[str, np.ndarray], Counter]:
+    """
+    Read messages as :func:`read_all`, those of equal layout together, which is faster.
+
+    Returns:
+        (M,) ascending indices of the readable messages; 'stamp' and each channel -> its (M,) or
+        (M, width) numbers, NaN for None; reason -> number of the other messages.
+
+    """
+    lengths = np.array([len(data) for data in messages])
+    found = {name: np.empty((len(lengths), width) if width else len(lengths))
+             for name, width in {'stamp': 0, **channels}.items()}
+    done = np.zeros(len(lengths), dtype=bool)
+
+    def fill(rows, value):
+        for name, column in found.items():
+            part = getattr(value, name)
+            column[rows] = np.nan if part is None else part
+
+    for length in np.unique(lengths):
+        rows = np.flatnonzero(lengths == length)
+        block = np.frombuffer(b''.join([messages[row] for row in rows]), np.uint8)
+        with suppress(Exception), np.errstate(all='ignore'):    # one by one they give reasons
+            together, alike = columns(block.reshape(-1, length), topic.type)
+            fill(rows, topic.read(together))
+            done[rows] = alike
+    others = np.flatnonzero(~done)
+    rows, values, refused = read_all(topic, [messages[row] for row in others])
+    for row, value in zip(others[rows], values, strict=True):
+        fill(row, value)
+        done[row] = True
+    return np.flatnonzero(done), {name: part[done] for name, part in found.items()}, refused
+
+
 def read_bag(path: str | Path) -> FlightLog:
     """
     Read a flight.
@@ -203,6 +268,14 @@ def read_bag(path: str | Path) -> FlightLog:
             topic, refused = topic_of(name), unused.setdefault(name, Counter())
             if messages.type != topic.type:
                 refused[f'type is {messages.type}, not {topic.type}'] += len(messages.data)
+                continue
+            if (channels := channels_of(name)) is not None:
+                rows, found, reasons = read_columns(topic, messages.data, channels)
+                received = messages.received[rows]
+                found['stamp'] = np.where(found['stamp'] == 0, received, found['stamp'])
+                recorder.write_rows(name, [*found.values(), received])
+                counts[name] += len(rows)
+                refused.update(reasons)
                 continue
             rows, values, reasons = read_all(topic, messages.data)
             refused.update(reasons)

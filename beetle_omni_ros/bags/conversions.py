@@ -1,7 +1,8 @@
 """
 Forms of messages: ROS type, class of the value, and conversion between both.
 
-A form is one entry; a topic of :mod:`.topics` has a form.
+A form is one entry; a topic of :mod:`.topics` has a form. ``read`` also converts the messages of
+:func:`.messages.columns`, whose numbers are arrays (N,), so that vectors have the shape (N, 3).
 """
 
 from __future__ import annotations
@@ -167,7 +168,7 @@ def vectors(name: str, value: type, frame: str, *, finite: Sequence[str] | None 
 
     def read(message):
         return after_read(value(stamp=seconds(message.header.stamp), **{
-            attribute: np.array(parts(message)) if parts else whole(message)
+            attribute: np.array(parts(message)).T if parts else whole(message)
             for attribute, _, whole, parts in vectors_at}), message)
 
     def write(value):
@@ -199,8 +200,10 @@ def _fill_battery(message, value):
 
 
 def _in_world(odom, message):
-    """Rotate the velocity from base_link to world."""
-    return replace(odom, velocity=rotations.matrix(odom.quaternion) @ odom.velocity)
+    """Rotate the velocity (3,) or (N, 3) from base_link to world."""
+    turn = rotations.matrix(odom.quaternion) if odom.velocity.ndim == 1 else np.reshape(
+        rotations.entries(*odom.quaternion.T), (3, 3, -1)).transpose(2, 0, 1)
+    return replace(odom, velocity=(turn @ odom.velocity[..., None])[..., 0])
 
 
 def _fill_odom(message, value):
@@ -239,12 +242,12 @@ ODOM = vectors('nav_msgs/msg/Odometry', BodyState, WORLD, after_read=_in_world,
 # --- messages of joints -------------------------------------------------------------------------
 
 def _of(message, field, names):
-    """Values (len(names),) of a field of a JointState, by name."""
+    """Values (len(names),) or (N, len(names)) of a field of a JointState, by name."""
     values = getattr(message, field)
     try:
         order = range(len(names)) if message.name[:len(names)] == names else \
             [message.name.index(name) for name in names]
-        return np.array([values[k] for k in order], dtype=float)
+        return np.array([values[k] for k in order], dtype=float).T
     except ValueError:
         raise MessageError(f"names are not {', '.join(names)}") from None
     except IndexError:

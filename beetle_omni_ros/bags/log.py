@@ -9,6 +9,7 @@ Times are float seconds on the flight's clock, ROS time in the graph. A loop rec
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +22,7 @@ from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.mode import FALLBACK, Mode
 
 _BODY = {'position': 3, 'quaternion': 4, 'velocity': 3, 'angular_velocity': 3}
-_COMMAND = {'received': 0, 'tilt': 4, 'thrust': 4}
+_COMMAND = {'tilt': 4, 'thrust': 4}
 SERIES = {
     'truth': ('ground_truth/odom', _BODY),
     'odom': ('odom', _BODY),
@@ -32,7 +33,7 @@ SERIES = {
     'command': ('command', _COMMAND),
     'wrench': ('disturbance', {'force': 3, 'torque': 3}),
 }
-"""Series of a log -> its topic, and channel -> width, 0 for a scalar."""
+"""Series of a log -> its topic, and channel -> width, 0 for a scalar; each has `received`, too."""
 
 CHANNELS = dict(SERIES.values())
 """Topic -> channels of its series."""
@@ -56,10 +57,12 @@ class Series(SimpleNamespace):
 
     Attributes:
         t: (N,) stamps [s]; one array of N rows for each channel of SERIES stands beside it.
+        received: (N,) times of recording [s].
 
     """
 
     t: np.ndarray
+    received: np.ndarray
 
     def __len__(self):
         return len(self.t)
@@ -89,8 +92,8 @@ class FlightLog:
         joint: ``position``, ``velocity``, ``effort`` (N, 4) [rad], [rad/s], [N m]; NaN where the
             message had none.
         battery: ``voltage`` [V] and ``current`` [A], negative discharging (N,).
-        command: commands to the actuators: ``t`` stamp of the answered estimate, ``received`` time
-            of recording [s], ``tilt`` (M, 4) [rad], ``thrust`` (M, 4) [N].
+        command: commands to the actuators: ``t`` stamp of the answered estimate, ``tilt`` (M, 4)
+            [rad], ``thrust`` (M, 4) [N].
         wrench: external ``force`` in world [N] and ``torque`` in base_link [N m], each valid until
             the next.
         requests: controller -> its commands, before the supervisor.
@@ -249,8 +252,12 @@ class LogRecorder(Recorder):
         values, received = zip(*self._pending.pop(topic), strict=True)
         columns = [[value.stamp for value in values]]
         for name, width in channels_of(topic).items():
-            parts = received if name == 'received' else [getattr(value, name) for value in values]
+            parts = [getattr(value, name) for value in values]
             columns.append([[np.nan] * width if part is None else part for part in parts])
+        self.write_rows(topic, [*columns, received])
+
+    def write_rows(self, topic: str, columns: Sequence) -> None:
+        """Record N values of a topic: stamps, channels and times of recording, each N rows."""
         self._rows[topic].append(np.column_stack(columns).astype(float))
 
     def _add_event(self, topic, value, received):
@@ -299,7 +306,7 @@ def channels_of(topic: str) -> dict[str, int] | None:
 
 def _series(rows, channels):
     """Sort rows by time into 't' and the channels."""
-    widths = {'t': 0, **channels}
+    widths = {'t': 0, **channels, 'received': 0}
     ends = np.cumsum([max(1, width) for width in widths.values()])
     table = np.concatenate([np.zeros((0, ends[-1])), *rows])
     table = table[np.argsort(table[:, 0], kind='stable')]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
+from types import SimpleNamespace
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -67,6 +68,45 @@ def from_bytes(data: bytes | memoryview, name: str) -> Any:
     definition = TYPESTORE.get_msgdef(name)
     return definition.deserialize_cdr_le(
         memoryview(data)[HEADER:], 0, definition.cls, TYPESTORE)[0]
+
+
+def columns(block: np.ndarray, name: str) -> tuple[Any, np.ndarray]:
+    """
+    Deserialise messages of a ROS type from (N, length) bytes of CDR together.
+
+    Returns:
+        A message with (N,) numbers and (W, N) arrays; (N,) whether the texts and lengths of a
+        message are those of the first one. The numbers of the other messages are meaningless.
+
+    """
+    from_bytes(block[0].tobytes(), name)    # raises for broken texts and lengths
+    place, alike = HEADER, (block[:, :HEADER] == block[0, :HEADER]).all(axis=1)
+
+    def take(kind, count, layout=False):
+        nonlocal place
+        size = np.dtype(kind).itemsize
+        place += (HEADER - place) % size if count else 0    # alignment
+        part = block[:, place:place + size * count]
+        place += size * count
+        if layout:
+            alike[(part != part[0]).any(axis=1)] = False
+        return np.ascontiguousarray(part).view(kind).T
+
+    def decode(node, what):
+        if node == Nodetype.NAME:
+            return SimpleNamespace(**{
+                field: decode(*of) for field, of in TYPESTORE.fielddefs[what][1]})
+        if node == Nodetype.BASE and what[0] != 'string':
+            return take(what[0], 1)[0]
+        size = what[1] if node == Nodetype.ARRAY else int(take('u4', 1, layout=True)[0, 0])
+        if node == Nodetype.BASE:
+            return take('u1', size, layout=True)[:-1, 0].tobytes().decode()
+        element, inner = what[0]
+        if element == Nodetype.BASE and inner[0] != 'string':
+            return take(inner[0], size)
+        return [decode(element, inner) for _ in range(size)]
+
+    return decode(Nodetype.NAME, name), alike
 
 
 def offered(qos: Qos) -> interfaces.Qos:

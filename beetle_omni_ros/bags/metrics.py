@@ -19,7 +19,13 @@ from beetle_omni_ros.bags.log import (
 )
 from beetle_omni_ros.bags.task_metrics import KINDS, L_WINDOW, reduced, U_WINDOW
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.control.tasks import GROUND_HEIGHT, make_task, POSE_DURATION, Task
+from beetle_omni_ros.control.tasks import (
+    GROUND_HEIGHT,
+    make_task,
+    POSE_DURATION,
+    SET_POINT_FILES,
+    Task,
+)
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.mode import DISARMED, FALLBACK, LANDING, MOTORS_OFF, STOPPED
 from beetle_omni_ros.model.schema import shortened
@@ -71,9 +77,9 @@ def metrics_by_controller(log: FlightLog, task: Task | None = None) -> dict[str,
 
 
 def task_of(log: FlightLog) -> Task | None:
-    """Make the named task in a log's metadata; None for pose files and flights without a task."""
+    """Make the named task in a log's metadata; None for files and flights without a task."""
     name = str(log.meta.get('task', ''))
-    if not name or name.lower().endswith('.csv'):
+    if not name or name.lower().endswith(('.csv', *SET_POINT_FILES)):
         return None
     try:
         return make_task(name, int(log.meta.get('seed') or 0))

@@ -1,4 +1,4 @@
-"""Checks of targets, for messages and for the rows of a pose file, and pose files."""
+"""Checks of targets, for messages and for files of poses and of set points, and these files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,13 @@ from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.files import missing, read_table
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.schema import parameter, ParameterError, ParameterFile
+from beetle_omni_ros.model.schema import (
+    numbers,
+    parameter,
+    ParameterError,
+    ParameterFile,
+    read_yaml,
+)
 
 OLDEST, AHEAD = 10.0, 1.0   # [s] a stamp may be before and after the present time
 START = (0.0, 0.0, 1.0)     # [m] position after the take-off
@@ -155,6 +161,43 @@ def check_steps(poses: np.ndarray, reach: float, where: Callable[[int], str]) ->
         raise ParameterError(f'{where(k)}: {steps[k]:.4g} m from '
                              f"{'the pose before' if k else 'the take-off'}, expected at most "
                              f'{reach:g} m: the reach of the controller')
+
+
+def read_set_points(path: str | Path, period: float
+                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Read the set points of a trajectory: rows of time [s], x, y, z [m], roll, pitch, yaw [deg].
+
+    Args:
+        path: YAML file with the key ``set_points``.
+        period: of the returned samples [s]; splines lead through the set points.
+
+    Returns:
+        (N,) times from 0 [s], (N, 3) positions in world [m], (N, 4) quaternions body to world.
+
+    Raises:
+        ParameterError: unusable file, or a pose outside the fence or too low.
+
+    """
+    from scipy.interpolate import CubicSpline  # would double the time to start
+    from scipy.spatial.transform import Rotation, RotationSpline
+    content = read_yaml(path)
+    if not isinstance(content, dict) or 'set_points' not in content:
+        raise ParameterError(f"{path}: expected the key 'set_points'")
+    rows = numbers(content['set_points'], f'{path}: set_points',
+                   dict.fromkeys(('low', 'high', 'unit')))
+    if rows.ndim != 2 or rows.shape[1] != 1 + len(COLUMNS) or len(rows) < 3 \
+            or rows[0, 0] != 0 or not (np.diff(rows[:, 0]) > 0).all():
+        raise ParameterError(f'{path}: set_points: expected at least 3 rows [time, x, y, z, roll, '
+                             'pitch, yaw] with times that increase from 0')
+    times = np.linspace(0.0, rows[-1, 0], max(round(rows[-1, 0] / period), 2) + 1)
+    positions = CubicSpline(rows[:, 0], rows[:, 1:4], bc_type='clamped')(times)
+    turns = Rotation.from_euler('xyz', rows[:, 4:], degrees=True)
+    quaternions = RotationSpline(rows[:, 0], turns)(times).as_quat()
+    for time, *pose in zip(times, positions, quaternions, strict=True):
+        if reason := _checks().why_not_pose(*pose):
+            raise ParameterError(f'{path}: at {time:.4g} s: {reason}')
+    return times, positions, quaternions
 
 
 def _columns(header):

@@ -2,11 +2,21 @@
 
 from dataclasses import fields, replace
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from beetle_omni_ros.bags.bag import read_all
-from beetle_omni_ros.bags.messages import Diagnostic, from_bytes, MessageError, to_bytes, Wrench
+from beetle_omni_ros.bags.bag import read_columns
+from beetle_omni_ros.bags.log import channels_of
+from beetle_omni_ros.bags.messages import (
+    columns,
+    Diagnostic,
+    from_bytes,
+    MessageError,
+    to_bytes,
+    Wrench,
+)
 from beetle_omni_ros.bags.topics import ALL
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.model import rotations
@@ -108,9 +118,45 @@ def test_unreadable_messages_are_counted_and_the_others_keep_their_order():
     at = 4 + 8 + 4 + 4      # behind stamp and the empty frame_id: the number of names
     length[at:at + 4] = (0xFFFFFFF0).to_bytes(4, 'little')
     data.append(bytes(length))
-    rows, values, refused = read_all(ALL['joint_states'], data)
+    rows, found, refused = read_columns(ALL['joint_states'], data, {'position': 4})
     assert refused.total() == 4 and [data[row] for row in rows] == [
-        cdr('joint_states', one) for one in values] == [cdr('joint_states', one) for one in sent]
+        cdr('joint_states', one) for one in sent]
+    assert found['stamp'].tolist() == [one.stamp for one in sent]
+    assert np.array_equal(found['position'], [one.position for one in sent])
+
+
+@pytest.mark.parametrize('topic', SERIES)
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 99), st.sampled_from(
+    ('', 'world', 'w0rld', 'joints', 'cut', 'long', 'encoding', 'text')))))
+def test_messages_of_equal_layout_are_read_together_as_one_by_one(topic, drawn):
+    entry, channels, data = ALL[topic], channels_of(topic) or {'speed': 4}, []
+    for seed, kind in drawn:
+        message = entry.write(value(topic, seed, STAMP + seed))
+        message.header.frame_id = kind
+        if kind == 'joints' and hasattr(message, 'name'):
+            message.name, part = message.name[::-1], ('velocity', 'effort')[seed % 2]
+            setattr(message, part, np.zeros(0))
+        sent = bytearray(to_bytes(message, entry.type))
+        if kind == 'text':
+            sent[15] = 255      # the text, or its length
+        data.append(bytes({'cut': sent[:-9], 'long': sent + b'abc', 'encoding': b'\0\0' + sent[2:]}
+                          .get(kind, sent)))
+    alone, refused = [], 0
+    for one in data:
+        try:
+            alone.append(entry.read(from_bytes(one, entry.type)))
+        except Exception:
+            refused += 1
+        else:       # none is left to the slower way
+            assert columns(np.frombuffer(one, np.uint8)[None], entry.type)[1].all()
+    rows, found, refusals = read_columns(entry, data, channels)
+    assert len(rows) == len(alone) and refusals.total() == refused
+    for name, column in found.items():
+        parts = [getattr(one, name) for one in alone]
+        np.testing.assert_allclose(column, np.reshape([
+            np.full(4, np.nan) if part is None else part for part in parts], column.shape),
+            rtol=1e-14, atol=1e-14)
 
 
 @pytest.mark.parametrize('topic', [name for name in SERIES if name != 'rotor_states'])

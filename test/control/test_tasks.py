@@ -134,3 +134,31 @@ def test_a_pose_file_is_read_with_blank_lines_spaces_and_columns_in_any_order(tm
     file = tmp_path / 'poses.csv'
     file.write_text('yaw_deg,x_m, y_m,z_m,roll_deg,pitch_deg\n\n90, 1 ,2,0.8,-5,6.5\n')
     assert make_task(file).poses.tolist() == [[1, 2, 0.8, -5, 6.5, 90]]
+
+
+def test_set_points_are_a_trajectory_through_each_of_them(tmp_path):
+    file = tmp_path / 'points.yaml'
+    rows = [[0, 0, 0, 1.2, 0, 0, 0], [2.0, 0.5, 0, 1.4, 0, 40, 90], [4.0, 1, 0, 1, 0, 0, 180]]
+    file.write_text(f'set_points: {rows}')
+    task = make_task(str(file))
+    target = targets_of(task, 10.0)[-1]
+    assert task.duration == pytest.approx(12.0)     # after 8 s at the first one
+    for time, *pose in rows:
+        k = round(time / 0.02)
+        assert target.times[k] == pytest.approx(18.0 + time)
+        assert target.positions[k] == pytest.approx(pose[:3])
+        turn = Rotation.from_euler('ZYX', pose[:2:-1], degrees=True)
+        assert (turn.inv() * Rotation.from_quat(target.quaternions[k])).magnitude() < 1e-6
+
+
+@pytest.mark.parametrize('content, text', [
+    ('poses: []', "expected the key 'set_points'"),
+    ('set_points: [[0, 0, 0, 1]]', 'at least 3 rows'),
+    ('set_points: [[0,0,0,1,0,0,0], [2,0,0,1,0,0,0], [1,0,0,1,0,0,0]]', 'increase from 0'),
+    ('set_points: [[0,0,0,1,0,0,0], [2,0,0,0.1,0,0,0], [4,0,0,1,0,0,0]]', 'the floor'),
+    ('set_points: [[0,0,0,1,0,0,0], [2,99,0,1,0,0,0], [4,0,0,1,0,0,0]]', 'the fence')])
+def test_set_points_are_refused_with_the_reason(tmp_path, content, text):
+    file = tmp_path / 'points.yaml'
+    file.write_text(content)
+    with pytest.raises(ParameterError, match=text):
+        make_task(str(file))

@@ -187,5 +187,5 @@ def test_a_servo_sags_under_a_module_that_hangs_beside_its_axis(sets, base, mome
                       (gravity * one, zero))
     robot = replace(ROBOT, effects={'module_reaction': {'module_inertia': 0.0,
                                                         'mass_moment': base}})
-    shown = simulate(robot, windows, np.zeros((1, k, 1, 4)), [sets], 0.0)[0, -1, 0]
+    shown = simulate(robot, windows, np.zeros((1, k, 1, 4)), [0], [sets], 0.0)[0, -1, 0]
     assert shown == pytest.approx(moment * gravity / ROBOT.joints.kp, rel=1e-3)

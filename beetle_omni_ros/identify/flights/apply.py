@@ -41,6 +41,13 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
     return effects
 
 
+def robot_with(robot: RobotParameters, effects: dict[str, dict]) -> RobotParameters:
+    """The robot with other effects; a ParameterError reports an impossible one."""
+    return replace(robot, effects={name: {k: tuple(v) if isinstance(v, list) else v
+                                          for k, v in values.items()}
+                                   for name, values in effects.items()})
+
+
 def own_numbers(robot: RobotParameters, tolerances: dict[str, dict],
                 named: Iterable[str] = ()) -> dict:
     """
@@ -113,9 +120,7 @@ def write_corrected(path: Path, results: dict, robot: RobotParameters,
     """
     effects = effects_with(robot, results['effects'])
     try:
-        replace(robot, effects={name: {k: tuple(v) if isinstance(v, list) else v
-                                       for k, v in values.items()}
-                                for name, values in effects.items()})
+        robot_with(robot, effects)
     except ParameterError as error:
         raise ParameterError(f'{path}: the corrected robot is not possible: {error}') from None
     named = [{'names': effect['names'],

@@ -172,7 +172,7 @@ class BagFlight:
         self._runs = dict(zip((key for key, _ in sets), runs, strict=True))
         now = self.residual(theta)
         residual = np.concatenate([now[group] for group in PLACE], axis=1)
-        slopes = np.zeros((*residual.shape, len(names)))
+        slopes = np.zeros((len(names), *residual.T.shape)).T
         # name -> key and factor of its slope; a tangent counts where its start acts
         factors = {name: (name, 1.0) for name in names
                    if name not in self.starts and name not in self.tangents}
@@ -197,7 +197,7 @@ class BagFlight:
 
     def _slopes(self, theta, now, names):
         """(M, 16, K) derivatives by keys at ``theta``, where the residual is ``now``."""
-        slopes = np.zeros((len(self.rows), len(self.channels), len(names)))
+        slopes = np.zeros((len(names), len(self.channels), len(self.rows))).T
         body = [k for k, name in enumerate(names) if self.keys[name].body]
         if body:
             slopes[:, PLACE['B'], body] = -self._body.derivatives(
@@ -297,10 +297,10 @@ class BagFlight:
     def _servos(self, sets, at):
         """Simulated servos (P, W, M, 4) of each set, with initial states and loads at ``at``."""
         windows, edges = self._windows(at)
-        delays = [self.signals.delays(theta)[0] for theta in sets]
-        of_delays = {delay: self._targets(edges, delay) for delay in set(delays)}
-        targets = [of_delays[delay] for delay in delays]
-        runs = simulate(self.robot, windows, np.array(targets), sets, self.modules)
+        delays, which = np.unique([self.signals.delays(theta)[0] for theta in sets],
+                                  return_inverse=True)
+        targets = np.array([self._targets(edges, delay) for delay in delays])
+        runs = simulate(self.robot, windows, targets, which, sets, self.modules)
         return runs.transpose(0, 2, 1, 3)
 
     def _targets(self, edges, delay):

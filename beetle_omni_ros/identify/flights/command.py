@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
 from beetle_omni_ros.bags.bag import names_of, runs_in
 from beetle_omni_ros.identify.flights.apply import write_corrected
+from beetle_omni_ros.identify.flights.next_flight import Planner
 from beetle_omni_ros.identify.flights.page import gap_page, grids, headline
 from beetle_omni_ros.identify.flights.results import ALPHA, result_of
 from beetle_omni_ros.identify.flights.verdict import judged, judged_tables, load_tables
@@ -43,7 +45,8 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
                 apply: Path | None = None, json_path: Path | None = None,
                 page: Path | None = None, console: Console | None = None,
                 parameters: Path | None = None, fix: bool = False, tolerances: bool = False,
-                form: str | None = None, alpha: float = ALPHA) -> dict:
+                form: str | None = None, alpha: float = ALPHA, next_task: Path | None = None,
+                experiments: Callable[[RobotParameters], Any] | None = None) -> dict:
     """
     Find differences between model and measurement; arguments of `beetle_omni gap`.
 
@@ -60,6 +63,8 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
         tolerances: whether ``apply`` has this robot's own numbers, too.
         form: format of tables of flights, by name or file; None: bags or joint logs.
         alpha: probability of a false alarm that is accepted.
+        next_task: task to write, a flight that decides what these left open.
+        experiments: makes what flies its manoeuvres, for ``next_task``.
 
     Returns:
         the results that are written as JSON.
@@ -79,14 +84,19 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
     runs, holdout = (list(given) if form else runs_in(given) for given in (runs, holdout))
     check_apart([*runs, *holdout])
     if form is None and any(is_joint_log(run) for run in runs):
+        if next_task:
+            raise ParameterError(f'--next {next_task}: expected flights, not logs of joints')
         with console.status('comparing the servos'):
             result, made_page = analyse_joint_logs(runs, holdout, model, robot)
         html = made_page() if page else ''
     else:
+        then = Planner(model, p, experiments(model), next_task) \
+            if next_task and experiments else None
         # On small matrices, several threads only take more CPU time.
         with console.status('reading') as status, threadpool_limits(1):
-            result = _tables(runs, holdout, model, p, form, alpha, status.update) if form \
-                else _bags(runs, holdout, model, p, fix, alpha, status.update)
+            result = _tables(runs, holdout, model, p, form, alpha, status.update,
+                             then) if form \
+                else _bags(runs, holdout, model, p, fix, alpha, status.update, then)
         result['meta'] |= {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                            'robot': str(robot) if robot else 'params/robot.yaml', 'alpha': alpha}
         html = gap_page(result, _damaged(result, [*runs, *holdout])) if page else ''
@@ -103,15 +113,15 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
     return result
 
 
-def _tables(runs, holdout, robot, p, form, alpha, progress):
+def _tables(runs, holdout, robot, p, form, alpha, progress, then):
     declared = Format.load(form)
     flights, judging = (load_tables(paths, robot, declared) for paths in (runs, holdout))
-    result = judged_tables(flights, judging, robot, p, declared, alpha, progress)
+    result = judged_tables(flights, judging, robot, p, declared, alpha, progress, then)
     result['meta']['format'] = declared.name
     return result
 
 
-def _bags(runs, holdout, robot, p, fix, alpha, progress):
+def _bags(runs, holdout, robot, p, fix, alpha, progress, then):
     given = [*runs, *holdout]
     flights, errors = [], []
     for path, name in zip(given, names_of(given), strict=True):
@@ -130,7 +140,7 @@ def _bags(runs, holdout, robot, p, fix, alpha, progress):
     if not judging and len(fitted) > LEAST_FITTED:
         fitted, judging = fitted[:-1], fitted[-1:]
     progress('weighing effects')
-    result = judged(fitted, judging, robot, p, alpha)
+    result = judged(fitted, judging, robot, p, alpha, then)
     result['findings'] += [text for flight in flights for text in flight.findings]
     return result
 
@@ -151,3 +161,6 @@ def _print(console, result):
     print_grids(grids(result), console)
     if result['next_experiment']:
         console.print(f"Next: {result['next_experiment']}", highlight=False, markup=False)
+    if result['next_flight']:
+        console.print(f"Next flight: {result['next_flight']['sentence']}", highlight=False,
+                      markup=False, soft_wrap=True)

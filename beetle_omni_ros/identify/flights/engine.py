@@ -211,7 +211,7 @@ class Engine:
             linear = self._linear(flight, at)
             # linear about the robot file
             residual = linear.residual - linear.slopes @ at
-            slopes = np.zeros((*residual.shape, len(self.names)))
+            slopes = np.zeros((len(self.names), *residual.T.shape)).T     # times are contiguous
             slopes[:, :, :self.real] = linear.slopes
             for at_flight, key, column in self.repeats:
                 if fitted and at_flight == k:
@@ -224,6 +224,15 @@ class Engine:
                              flight.highest, self.groups, own)
             spectra.append(found)
         return spectra
+
+    def others(self, flights: Sequence, theta: np.ndarray) -> tuple[list, bool]:
+        """Spectra of flights at ``theta`` (K,), common filter; whether they are the fitted."""
+        keep, fitted = (self.flights, self.generic, self.filters), list(flights) == self.flights
+        self.flights, self.filters = list(flights), [self.common] * len(flights)
+        self.generic = discrepancies(self.flights)
+        spectra = self._spectra(theta, np.zeros((len(flights), len(self.names))), fitted)
+        self.flights, self.generic, self.filters = keep
+        return spectra, fitted
 
     def _linear(self, flight, at):
         """Linear model of a flight at real keys; the last one is kept."""

@@ -21,10 +21,10 @@ from math import comb, exp, inf, log, log1p, pi, sqrt
 
 import numpy as np
 from scipy.special import log_ndtr
-from scipy.stats import norm, t
 
 from beetle_omni_ros.identify.flights.keys import Entry
 from beetle_omni_ros.identify.flights.spectrum import Spectrum
+from beetle_omni_ros.identify.inference.noise import few_blocks
 
 NONE = np.zeros(0, dtype=int)
 
@@ -191,9 +191,8 @@ class Judge:
         self.covariance = np.linalg.inv(equations.info + np.diag(narrow**-2))
         self.mean = self.covariance @ equations.right
         self.blocks = len(equations.scores)
-        # The scatter between few blocks is uncertain: variance by Student's t at this level.
         self.owner, self.far = owner, far
-        self.student = float((t.isf(level / 2, max(self.blocks - 1, 1)) / norm.isf(level / 2))**2)
+        self.student = few_blocks(level, self.blocks)
         self._kept: dict[tuple[int, ...], Posterior] = {}
         self._profiles: dict[tuple[int, ...], tuple] = {}
 

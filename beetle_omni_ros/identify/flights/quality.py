@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import f as f_law
 from scipy.stats import t as student
 
-from beetle_omni_ros.identify.flights.discrepancy import acting, discrepancies, features_of
+from beetle_omni_ros.identify.flights.discrepancy import acting, features_of
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import Solution
 from beetle_omni_ros.identify.flights.spectrum import pooled, Spectrum, spectrum
@@ -81,15 +81,9 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
     The flights' own deviations are fitted within their priors in each case. The noise is that
     of the fitted flights.
     """
-    keep = engine.flights, engine.generic, engine.filters
-    engine.flights, engine.filters = list(flights), [engine.common] * len(flights)
-    engine.generic = discrepancies(engine.flights)
-    zeros = np.zeros((len(flights), len(engine.names)))
     theta = np.concatenate([solution.theta[:engine.known],
                             np.zeros(len(engine.names) - engine.known)])
-    fitted = engine.flights == keep[0]
-    spectra = engine._spectra(theta, zeros, fitted)
-    engine.flights, engine.generic, engine.filters = keep
+    spectra, fitted = engine.others(flights, theta)
     noise, total, count = pooled(solution.spectra), np.zeros(3), 0
     less = theta.copy()
     less[engine.indices(named)] = 0.0

@@ -55,7 +55,7 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
         'closure': None, 'gap_before': None, 'gap_after': None, 'noise_floor': None,
         'candidates': [], 'hidden': [], 'tolerances': {}, 'false_alarm_probability': None,
         'held_out': False, 'groups': groups, 'bad_data': [], 'findings': [],
-        'next_experiment': None, 'meta': {'version': __version__}} | more
+        'next_experiment': None, 'next_flight': None, 'meta': {'version': __version__}} | more
     seen = {row['name'] for row in result['candidates']} - set(result['hidden'])
     if verdict == 'no_gap' and len(result['hidden']) > len(seen):
         result |= {'verdict': (verdict := 'not_decidable'), 'reason': (
@@ -161,16 +161,17 @@ def effect_of(solution: Solution, engine: Engine, keys: dict[str, Key], k: int,
     result: dict = {
         'names': list(dict.fromkeys(solution.entries[j].name for j in members)),
         'members': list(dict.fromkeys(solution.entries[j].label for j in members)),
-        'parameters': sizes(k), 'layer': CATALOGUE[entry.name].layer, **_member(entry),
+        'parameters': sizes(k), 'layer': CATALOGUE[entry.name].layer, **member_of(entry),
         'evidence': {'ln_bayes_factor': gain, 'delta_bic': 2 * gain,
                      'constancy': -solution.unsteady.get(k, 0.0)}}
-    if rivals := [{'name': solution.entries[j].name, **_member(solution.entries[j]),
+    if rivals := [{'name': solution.entries[j].name, **member_of(solution.entries[j]),
                    'parameters': sizes(j)} for j in members[1:]]:
         result['rivals'] = rivals
     return result
 
 
-def _member(entry):
+def member_of(entry: Entry) -> dict[str, int]:
+    """Number of the rotor or joint of an entry of one of them."""
     return {CATALOGUE[entry.name].each: entry.member} if entry.member is not None else {}
 
 
@@ -233,7 +234,7 @@ def candidates_of(solution: Solution, taken: Sequence[int]) -> list[dict]:
             continue
         gain = solution.gains.get((k,))
         index = [solution.names.index(key) for key in entry.keys]
-        row = {'name': entry.name, **_member(entry), 'accepted': k in taken,
+        row = {'name': entry.name, **member_of(entry), 'accepted': k in taken,
                'reason': 'value differs between frequencies' if k in solution.banned else '',
                'evidence': {'ln_bayes_factor': gain,
                             'delta_bic': None if gain is None else 2 * gain},

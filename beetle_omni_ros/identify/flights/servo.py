@@ -46,7 +46,7 @@ class Windows:
     undescribed: tuple[np.ndarray, ...] = ()
 
 
-def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
+def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray, which: np.ndarray,
              sets: list[dict[str, float]], modules: float) -> np.ndarray:
     """
     Free runs of the servos.
@@ -54,7 +54,8 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
     Args:
         robot: parameters of the robot file with its effects.
         windows: windows of one flight.
-        targets: (P, K, W, 4) commands for each set [rad].
+        targets: (D, K, W, 4) different commands [rad].
+        which: (P,) index of the commands of each set.
         sets: P sets of deviations by key name.
         modules: share of the file's tilting modules.
 
@@ -77,7 +78,7 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
     loads = _loads(windows, hanging, modules, column)
 
     def terms_at(k):
-        result = ServoTerms(targets[:, k], windows.thrust[k])
+        result = ServoTerms(targets[which, k], windows.thrust[k])
         for act, values in acting:
             act(result, None, **values)
         for torque, size in loads:

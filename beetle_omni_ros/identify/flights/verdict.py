@@ -12,6 +12,7 @@ from beetle_omni_ros.identify.flights.bag_flight import BagFlight, starts_of
 from beetle_omni_ros.identify.flights.balance import Balance, SLOW
 from beetle_omni_ros.identify.flights.body import BodyModel, swing_of, tilting_modules
 from beetle_omni_ros.identify.flights.engine import Engine
+from beetle_omni_ros.identify.flights.evidence import Solution
 from beetle_omni_ros.identify.flights.keys import (
     all_keys,
     entries_of,
@@ -27,7 +28,7 @@ from beetle_omni_ros.identify.flights.keys import (
     VARYING,
 )
 from beetle_omni_ros.identify.flights.quality import explained
-from beetle_omni_ros.identify.flights.results import ALPHA, concluded, result_of
+from beetle_omni_ros.identify.flights.results import ALPHA, concluded, result_of, Starts
 from beetle_omni_ros.identify.flights.signals import IMU_LAG
 from beetle_omni_ros.identify.flights.table_flight import COMPARED, GROUPS, TableFlight
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
@@ -55,11 +56,11 @@ WEIGHED = 'mass', 'inertia'
 LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
 # Entries of the comparison of IMU and MoCap.
 SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
-
+Then = Callable[[Engine, Solution, dict, Starts | None], dict]     # further results
 
 def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: RobotParameters,
-           p: GapParameters, alpha: float = ALPHA) -> dict:
-    """Results of checked flights of bags; ``judging`` is held out."""
+           p: GapParameters, alpha: float = ALPHA, then: Then | None = None) -> dict:
+    """Results of checked flights of bags; ``judging`` is held out. ``then`` may add to them."""
     keys = {**all_keys(robot), **extra_keys()}
     body = BodyModel(robot, keys, tilting_modules(robot))
     every = [BagFlight(flight, robot, body, keys, p) for flight in [*flights, *judging]]
@@ -92,8 +93,9 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     solution = engine.run()
     for model in others:
         model.settle(dict(zip(engine.names[:engine.real], solution.theta, strict=False)))
-    return concluded(engine, solution, keys, others or models, BAG_GROUPS, starts=starts,
-                     held_out=bool(judging))
+    result = concluded(engine, solution, keys, others or models, BAG_GROUPS, starts=starts,
+                       held_out=bool(judging))
+    return result | then(engine, solution, result, starts) if then else result
 
 
 def _priors(robot, keys, tolerance, stamps=0.0, weighed=WEIGHED):
@@ -196,10 +198,10 @@ def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
 
 def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight],
                   robot: RobotParameters, p: GapParameters, declared: Format,
-                  alpha: float = ALPHA, progress: Callable[[str], None] = lambda text: None
-                  ) -> dict:
+                  alpha: float = ALPHA, progress: Callable[[str], None] = lambda text: None,
+                  then: Then | None = None) -> dict:
     """
-    Results of flights of one format; ``judging`` is held out.
+    Results of flights of one format; ``judging`` is held out. ``then`` may add to them.
 
     Raises:
         ParameterError: a flight has other channels than the first one.
@@ -236,9 +238,10 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
     if slow:
         groups['torque'] = {'used': True, 'channels': ['torque_x', 'torque_y'],
                             'reason': 'no gyroscope: means of 2 s, by the attitude'}
-    return concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
-                     findings=findings, slow=Balance(slow, robot) if slow else None,
-                     measured='specific_force' in declared.signals)
+    result = concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
+                       findings=findings, slow=Balance(slow, robot) if slow else None,
+                       measured='specific_force' in declared.signals)
+    return result | then(engine, solution, result, None) if then else result
 
 
 def _groups(flight, declared):

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from itertools import product
 
 import numpy as np
+from scipy.stats import norm
 from scipy.stats import t as student
 
 HUBER = 3.0                 # standard deviations from which the loss is linear
@@ -123,3 +124,8 @@ def drifting(residuals: list[np.ndarray], signals: list[np.ndarray], slowest: in
         if value > best[0]:
             best = value, noise, np.array(scales)
     return best[1], best[2]
+
+
+def few_blocks(level: float, blocks: int) -> float:
+    """Factor of a variance because the scatter of few blocks is uncertain: Student's t."""
+    return float((student.isf(level / 2, max(blocks - 1, 1)) / norm.isf(level / 2))**2)

@@ -8,18 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.bags.bag import BagError, read_all, read_together
+from beetle_omni_ros.bags.bag import BagError, read_columns, read_together
+from beetle_omni_ros.bags.log import CHANNELS, FlightLog, SERIES
 from beetle_omni_ros.bags.messages import from_bytes
 from beetle_omni_ros.bags.topics import ALL
 from beetle_omni_ros.model.parameters import JOINT_NAMES, ROTOR_NAMES
 
-# Topic -> columns of its table; PARTS: fields of the message that they come from.
-NEEDED = {'imu/data_raw': 6, 'mocap/pose': 7, 'joint_states': 4, 'command': 8}
-OPTIONAL = {'battery_state': 2}
-IMU, POSE, JOINTS, COMMAND, BATTERY = *NEEDED, *OPTIONAL
-PARTS = {'imu/data_raw': ('specific_force', 'angular_velocity'),
-         'mocap/pose': ('position', 'quaternion'), 'joint_states': ('position',),
-         'command': ('tilt', 'thrust'), 'battery_state': ('voltage', 'current')}
+NEEDED = IMU, POSE, JOINTS, COMMAND = 'imu/data_raw', 'mocap/pose', 'joint_states', 'command'
+BATTERY = 'battery_state'
+# topic -> the columns of its table
+PARTS = {topic: CHANNELS[topic] for topic in (*NEEDED, BATTERY)} | {JOINTS: {'position': 4}}
 
 
 @dataclass
@@ -81,11 +79,10 @@ def read_recording(path: str | Path) -> Recording:
             else:
                 _note(states, messages)
     times, values, received = {}, {}, {}
-    for name, width in {**NEEDED, **OPTIONAL}.items():
-        rows, read, refused = read_all(ALL[name], data[name])
-        times[name] = np.array([value.stamp for value in read], dtype=float)
-        values[name] = np.column_stack([[getattr(value, part) for value in read]
-                                        for part in PARTS[name]]) if read else np.zeros((0, width))
+    for name in PARTS:
+        rows, table, refused = read_columns(ALL[name], data[name], PARTS[name])
+        times[name] = table.pop('stamp')
+        values[name] = np.column_stack(list(table.values()))
         received[name] = np.concatenate([np.zeros(0), *when[name]])[rows]
         if refused:
             bad[name] = bad.get(name, 0) + refused.total()
@@ -96,6 +93,17 @@ def read_recording(path: str | Path) -> Recording:
     _check_members(path, data, times)
     warnings += [f'{name}: {count} messages not readable' for name, count in bad.items()]
     return Recording(Path(path).name, times, values, states, warnings, received)
+
+
+def recording_of(log: FlightLog, name: str) -> Recording:
+    """A flight in memory as it is read from a bag."""
+    series = {topic: getattr(log, own) for own, (topic, _) in SERIES.items() if topic in PARTS}
+    return Recording(
+        name, {topic: own.t for topic, own in series.items()},
+        {topic: np.column_stack([getattr(series[topic], channel) for channel in channels])
+         for topic, channels in PARTS.items()},
+        [(float(t), str(mode)) for t, mode in zip(log.state_t, log.states, strict=True)],
+        received={topic: own.received for topic, own in series.items()})
 
 
 def _note(states, messages):
