@@ -37,7 +37,7 @@ def test_it_keeps_the_rules_of_gymnasium(env):
 
 
 def test_the_shipped_policy_reaches_a_pose_and_repeats_by_the_seed(env):
-    network = PolicyNetwork(share_path('policies/rl.onnx'), RobotParameters.load(), False)
+    network = PolicyNetwork(share_path('policies/rl.onnx'), RobotParameters.load())
     first, fell, info = flown(env, lambda seen: network(seen.tolist()), [0.3, 0, 1.2, 40, 0, 0])
     again, *_ = flown(env, lambda seen: network(seen.tolist()), [0.3, 0, 1.2, 40, 0, 0])
     assert not fell and len(first) == 600
