@@ -34,6 +34,7 @@ from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.show import figures, scene
 from beetle_omni_ros.show.figures import AFTER, BEFORE, colours_of, FAINT, INK, PARTS, STYLE
+from beetle_omni_ros.show.recorded import recorded_scene
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -231,7 +232,8 @@ OTHERS: dict[str, tuple[str, tuple[Callable, ...]]] = {
     'comparison/*_convergence_*.png': ('make compare', (
         comparison_page.convergence, figures.legend)),
     'comparison/*_errors_*.png': ('make compare', (comparison_page.in_time, figures.legend)),
-    'pictures/view.png': ('beetle_omni view RUN RUN, photographed in a browser', (scene.Room,))}
+    'pictures/view.png': ('beetle_omni view RUN RUN, photographed in a browser', (
+        scene.Room, recorded_scene))}
 
 
 def sources(function: Callable) -> str:

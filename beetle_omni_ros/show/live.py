@@ -13,6 +13,7 @@ from beetle_omni_ros.show.page import rendered
 from beetle_omni_ros.show.scene import Moment, Room, segments, target_at
 
 RATE = 30.0             # [Hz]
+LABEL_HEIGHT = 0.5      # [m] above the robot
 TRAIL, TRAIL_EVERY = 400, 2     # points of the path behind the robot; pictures between them
 
 
@@ -77,6 +78,8 @@ class Newest(Recorder):
 def draw(server: viser.ViserServer, graph) -> None:
     """Draw a :class:`~beetle_omni_ros.ros.operator.LiveGraph` as it runs, until Ctrl-C."""
     newest, room = Newest(), Room(server)
+    label = server.scene.add_label('/label', '', anchor='bottom-center',
+                                   position=(0.0, 0.0, LABEL_HEIGHT))
     server.gui.add_html(rendered('viewer.html', live=True))
     follow = server.gui.add_checkbox('Follow the robot', True)
     shown = server.gui.add_markdown('')
@@ -87,7 +90,9 @@ def draw(server: viser.ViserServer, graph) -> None:
         moment = newest.moment()
         with server.atomic():
             if moment:
-                room.show([moment], moment.text(), follow.value)
+                room.show([moment], follow.value)
+                if label.text != moment.text():
+                    label.text = moment.text()
                 if path is None:
                     trail = np.tile(moment.position, (TRAIL, 1))
                     path = room.draw_path(0, trail)

@@ -39,19 +39,19 @@ def recorded_scene(logs: Mapping[str, FlightLog]) -> str:
         for number, path in enumerate(paths):
             room.draw_path(number, path[::max(1, len(path) // PATH_POINTS)])
         recording = server.get_scene_serializer()
-        text = ''
         columns = [moments(log, log.begin + times) for log in logs.values()]
         with server.atomic():       # nothing is sent in between
-            for k, row in enumerate(zip(*columns, strict=True)):
-                if k % TEXT_EVERY == 0:
-                    text = '\n'.join([f'{times[k]:.1f} s', *(
-                        f'{name}: {moment.text()}' for name, moment in zip(logs, row) if moment)])
-                room.show(row, text)
+            for row in zip(*columns, strict=True):
+                room.show(row)
                 recording.insert_sleep(float(step))
         page = recording.as_html()
     finally:
         close(server)
-    head = rendered('viewer.html', title=title(next(iter(logs.values())).meta),
+    # Texts are HTML: a label of viser lags behind a jump, for it draws few new letters a picture.
+    texts = [[moment.text() if moment else '' for moment in column[::TEXT_EVERY]]
+             for column in columns]
+    head = rendered('viewer.html', title=title(next(iter(logs.values())).meta), texts=texts,
+                    begin=begin, every=TEXT_EVERY * step,
                     runs=zip(logs, colours_of(logs.values())))
     return page.replace('</head>', head + '</head>', 1)
 

@@ -21,7 +21,6 @@ GHOST_OPACITY = 0.35
 SKY = 4.0               # brightness of the ambient light, in place of slow reflections
 FLOOR, HORIZON = 80.0, 30.0     # [m] width, with a line at each metre; distance where it fades
 TARGET_AXES = 0.28      # [m]
-LABEL_HEIGHT = 0.5      # [m] above the robot
 # Of the camera from the robot [m], and its vertical angle [rad]: the robot fills a third.
 VIEW_FROM, VIEW_ANGLE = np.array([-1.2, -1.95, 0.5]), np.radians(48)
 WORLD = '/world'        # moves against the followed robot, so that the camera need not
@@ -164,7 +163,7 @@ def _arrow(begin, force):
 
 
 class Room:
-    """Floor, light, camera, robots of these colours, one text above the followed robot."""
+    """Floor, light, camera, and robots of these colours."""
 
     def __init__(self, server: viser.ViserServer, colours: Sequence[str] = COLOURS[:1]):
         scene, camera = server.scene, server.initial_camera
@@ -176,20 +175,16 @@ class Room:
         scene.add_grid(f'{WORLD}/floor', FLOOR, FLOOR, cell_size=1.0, section_size=FLOOR,
                        fade_distance=HORIZON, shadow_opacity=0.0, cell_color=(150, 158, 166),
                        plane_color=(128, 134, 140), plane_opacity=0.25)
-        self._label = scene.add_label('/label', '', anchor='bottom-center',
-                                      position=(0.0, 0.0, LABEL_HEIGHT))
         self._scene, self._colours = scene, colours
         camera.look_at, camera.position, camera.fov = np.zeros(3), VIEW_FROM, VIEW_ANGLE
         self.robots = [Robot(scene, number, colour) for number, colour in enumerate(colours)]
 
-    def show(self, moments: Sequence[Moment | None], text: str, follow: bool = True) -> None:
+    def show(self, moments: Sequence[Moment | None], follow: bool = True) -> None:
         """Draw all robots at one moment; ``follow`` the first of them that has a pose."""
         for robot, moment in zip(self.robots, moments, strict=True):
             robot.show(moment)
         if follow and (first := next(filter(None, moments), None)):
             self._world.position = -first.position
-        if self._label.text != text:
-            self._label.text = text
 
     def draw_path(self, number: int, positions: np.ndarray):
         """Draw the path (N, 3) [m] of a robot; returns its handle, whose ``points`` may change."""

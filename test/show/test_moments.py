@@ -41,11 +41,11 @@ def test_the_drawn_robot_tilts_and_its_arrows_are_as_long_as_the_thrusts(log):
         room = Room(server, COLOURS[:2])
         moment, = moments(log, np.array([55.0]))
         moment.tilt, moment.thrust = np.array([0.3, -1.2, 2.5, 0.0]), np.array([8.0, 4.0, 0.0, 1])
-        room.show([moment, None], 'here')
+        room.show([moment, None])
         drawn, hidden = room.robots
         np.testing.assert_allclose(room._world.position, -moment.position)
         moment.position = moment.position + 1.0
-        room.show([moment, None], 'here', follow=False)
+        room.show([moment, None], follow=False)
         np.testing.assert_allclose(room._world.position, 1.0 - moment.position)
         assert drawn._root.visible and not hidden._root.visible
         for k, name in enumerate(JOINT_NAMES):
