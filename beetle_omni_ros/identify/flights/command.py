@@ -161,6 +161,6 @@ def _print(console, result):
     print_grids(grids(result), console)
     if result['next_experiment']:
         console.print(f"Next: {result['next_experiment']}", highlight=False, markup=False)
-    if result['next_flight']:
+    if result.get('next_flight'):
         console.print(f"Next flight: {result['next_flight']['sentence']}", highlight=False,
                       markup=False, soft_wrap=True)
