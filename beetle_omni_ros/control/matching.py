@@ -90,7 +90,9 @@ class ModelMatching:
         """
         present = self._estimator.observe(state)
         step, self._stamp = state.stamp - self._stamp, state.stamp
-        if self._own is None or not 0 < step <= LONGEST_STEP:
+        own = next((own for sent, own in self._latest if same(sent, state.command)), None)
+        # Without an own command in force, as on standby, the actuators are those of the robot.
+        if own is None or self._own is None or not 0 < step <= LONGEST_STEP:
             self._thrust = self._scale * present[model.THRUST]
             self._change, self._acting = np.zeros(8), np.zeros(8)
         else:
@@ -102,12 +104,10 @@ class ModelMatching:
                 -step / self._trained.rotors.time_constant)) * (self._own.thrust - self._thrust)
         self._seen = seen = self._estimator.flown(present, state.stamp, self._ahead)
         moved = seen - present
-        own = next((own for sent, own in self._latest if same(sent, state.command)),
-                   state.command)
         return replace(state, position=seen[model.POSITION], velocity=seen[model.VELOCITY],
                        quaternion=seen[model.QUATERNION], angular_velocity=seen[model.RATE],
                        tilt=state.tilt + moved[model.TILT] - self._acting[:4],
-                       tilt_velocity=seen[model.TILT_RATE], command=own)
+                       tilt_velocity=seen[model.TILT_RATE], command=own or state.command)
 
     def sent(self, own: Command) -> Command:
         """Command for the flown robot, for the policy's own one on :meth:`observed`."""

@@ -110,6 +110,17 @@ def test_own_commands_are_recognised_and_those_of_others_stay():
     assert matching.observed(state(STEP, x, sent)).command is own
 
 
+def test_on_standby_the_tilts_are_those_of_the_other_controller():
+    matching, x = ModelMatching(TRAINED, robot(mass={'mass': 3.5}), DELAY, 10), np.zeros(25)
+    x[[2, 9]], x[model.THRUST] = 1.0, HOVER[4:]
+    x[model.TILT] = 0.5, -0.5, 0.5, 0.2
+    flown = np.r_[x[model.TILT], HOVER[4:]]
+    for k in range(50):     # its own commands, with changes of the tilts, are not flown
+        seen = state(k * STEP, x, command((k - 1) * STEP, flown))
+        np.testing.assert_allclose(matching.observed(seen).tilt, seen.tilt, atol=1e-9)
+        assert matching.sent(command(k * STEP, flown)).tilt != pytest.approx(flown[:4], abs=1e-3)
+
+
 def test_commands_stay_within_the_limits_of_the_flown_robot():
     weak = robot(thrust_coefficient={'scale': 0.5}, mass={'mass': 6.0})
     matching = ModelMatching(TRAINED, weak, DELAY, 10)
