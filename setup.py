@@ -26,7 +26,8 @@ def version():
 def shared(*folders):
     """List the files below ``folders`` as data files under ``share/beetle_omni_ros``."""
     files = [path for folder in folders for path in sorted(Path(folder).rglob('*'))
-             if path.is_file() and path.suffix != '.pyc' and not path.name.startswith('.')]
+             if path.is_file() and path.suffix != '.pyc' and not path.name.startswith('.')
+             and 'build' not in path.parts]
     parents = sorted({path.parent for path in files})
     return [(f'share/{PACKAGE}/{parent.as_posix()}',
              [path.as_posix() for path in files if path.parent == parent])
@@ -142,7 +143,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
-        *shared('params', 'policies', 'launch', 'description', 'viewers'),
+        *shared('params', 'policies', 'launch', 'description', 'viewers', 'firmware'),
     ],
     zip_safe=False,
     install_requires=REQUIREMENTS,
