@@ -139,7 +139,7 @@ setup(
     license='BSD-3-Clause',
     python_requires='>=3.10,<3.14',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={'': ['*.c', '*.css', '*.h', '*.html', '*.md']},
+    package_data={'': ['*.c', '*.css', '*.h', '*.html', '*.md', '*.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

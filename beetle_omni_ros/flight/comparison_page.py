@@ -13,7 +13,6 @@ from PIL import Image
 from beetle_omni_ros.bags.metrics import L_WINDOW, U_WINDOW
 from beetle_omni_ros.control.tasks import make_task, POSE_DURATION, RISING, TILTS
 from beetle_omni_ros.flight.summary import (
-    CONDITIONS,
     kind_of,
     look,
     METRICS,
@@ -25,6 +24,7 @@ from beetle_omni_ros.flight.summary import (
 from beetle_omni_ros.show import figures
 from beetle_omni_ros.show.figures import FAINT, INK, legend, panels
 from beetle_omni_ros.show.page import ABSENT, Grid, number
+from beetle_omni_ros.show.table import TEXTS
 
 # --- figures of the results of one task under one set of conditions ------------------------------
 
@@ -150,52 +150,10 @@ DOTS = 180  # per inch
 COLOURS = 128  # of a picture; enough for thin lines with smooth edges
 TITLE = 'RL and NMPC under one architecture'
 COMPUTED = ('"0.3 on average"', '"typically within 10"')    # published times of a step
-TEXTS = {
-    'random': 'One pose after the other, 8 s each, x and y within 2 m, z from 0.6 to 2 m, any '
-              'attitude, upside down included.',
-    'waypoints': 'The five poses of the real-world experiment, 8 s each, three rounds.',
-    'lemniscate': 'Position, roll, pitch and yaw follow a figure of eight in space, five rounds; '
-                  'the policies were trained for poses, not for trajectories.',
-    'force': 'A vertical force that rises until control is lost.',
-    'torque': 'Torque impulses that rise until control is lost.',
-    'wind': 'A fan blows along x at 2, 3 and 4 m/s, with the turbulence of a jet.',
-    'pushes': 'A stick pushes from four sides, 10 N for 0.1 s.',
-    'payload': 'Masses attached while hovering, unknown to estimator and controllers.',
-    'hover': 'How still the robot stands, and how smooth its commands are.'}
-POSES = 'U: mean over 7.0 to 7.5 s of the 8 s of a pose; L: over 1.0 to 7.0 s. A crash ends a ' \
-        'flight; the later poses are not reached, and have no errors. Reached: U below 0.10 m ' \
-        'and 10 deg.'
-RISING_LEVELS = '{} along {} for {:g} s at each level, then {:g} s of rest, while hovering at ' \
-                '[0, 0, 1.5] m with 25 deg of roll. Lost: more than 1.5 m away, on the ground, ' \
-                'or turned by more than 90 deg when the next level is due. That ends the ' \
-                'flight. Never lost counts as one level more.'
-NOTES = {
-    'intervals': 'Cells: mean [95 % interval]; "of n" where fewer than the others flew to the '
-                 'end. Second lines: difference to the best mean, paired by seed{}. Bold: every '
-                 'difference to it excludes zero.',
-    'poses': POSES,
-    'random': f'{POSES} The published poses are drawn from the same ranges, not the same; whether '
-              'their |q* − q| counts the whole flight or the hover is not stated.',
-    'waypoints': f'{POSES} Ours is simulated, the published columns are measured on the real '
-                 'robot: not the same experiment. A value is the mean of a flight.',
-    'lemniscate_large': 'As the lemniscate, with 2.5 rad of roll and pitch.',
-    'lemniscate': 'Ours is simulated, the published columns are measured on the real robot. The '
-                  "curve is that of the authors' code. A value is the mean of a flight.",
-    **{name: RISING_LEVELS.format(kind.capitalize(), 'xyz'[int(np.flatnonzero(direction)[0]) % 3],
-                                 *times)
-       for name, (kind, direction, _, *times) in RISING.items()},
-    'wind': 'Errors from 2 s to 10 s at 4 m/s. The published columns are of the real robot.',
-    'pushes': 'Means over four pushes; not recovered counts as 5 s. The published columns are of '
-              'the real robot.',
-    'payload': 'Magnitudes of the mean over 7.0 to 7.5 s after the mass was attached. The '
-               'publication shows its real robot in a figure without numbers, with 1.0 kg for RL '
-               'only.',
-    'hover': 'At [0, 0, 1] m. Errors from 8 s to the end of 60 s; command changes from 7.0 to '
-             '7.5 s.',
-    'glance': 'Published numbers are of Gazebo, or of the real robot where marked with *; ours '
-              'are simulated. Bold as in the tables below, which have the intervals. CPU times: '
-              "everything for one command on one core, median of the flights' medians; the "
-              "published ones are of the robot's ARM board, that of RL of the inference alone."}
+NOTES = {**TEXTS['notes'], **{
+    name: TEXTS['notes']['rising'].format(
+        kind.capitalize(), 'xyz'[int(np.flatnonzero(direction)[0]) % 3], *times)
+    for name, (kind, direction, _, *times) in RISING.items()}}
 
 
 @dataclass(frozen=True)
@@ -326,7 +284,7 @@ def sections(results: dict, flown: dict) -> list[Section]:
                         blocks.append(Picture(f'{kind_of(task)}_{name}_{conditions}',
                                               f'{caption} ({conditions} conditions)',
                                               png(figure)))
-            made.append(Section(task_title(task), TEXTS.get(kind_of(task), ''), blocks))
+            made.append(Section(task_title(task), TEXTS['texts'].get(kind_of(task), ''), blocks))
     return made
 
 
@@ -346,7 +304,7 @@ def content(results: dict, made: list[Section]) -> dict:
     for name in meta['controllers']:
         what = look(name).text or meta['specs'].get(name, '')
         terms.append((look(name).label, f"{what}; guidance: {meta['guidance'][name]}"))
-    terms += [(f'{name} conditions', CONDITIONS[name]) for name in meta['conditions']]
+    terms += [(f'{name} conditions', TEXTS['conditions'][name]) for name in meta['conditions']]
     terms += [(f'{name}: not flown', reason) for name, reason in meta['skipped'].items()]
     failed = sum(bool(flight['failure']) for flight in results['flights'])
     facts = [f"beetle_omni_ros {meta['version']}"
