@@ -92,7 +92,7 @@ GYM = [
     'gymnasium>=1.0,<2',
 ]
 
-# show/notebook.py alone: tables, and what plotly needs to draw in a cell.
+# show/report.py alone: tables, and what plotly needs to draw in a cell.
 NOTEBOOK = [
     'nbformat>=5',
     'pandas>=2,<4',

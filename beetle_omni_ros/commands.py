@@ -341,7 +341,7 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
 
     Needs the extra 'train' and a GPU.
     """
-    from beetle_omni_ros.train.command import parse_changes, run_train
+    from beetle_omni_ros.train.runner import parse_changes, run_train
     run_train(output=output, config=config, robot=robot, device=device, resume=resume,
               teacher=teacher, changes=parse_changes(changes, seed=seed),
               smoke=smoke, stop_after=stop_after, json_path=json_path)

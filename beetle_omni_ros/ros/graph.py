@@ -29,15 +29,15 @@ from beetle_omni_ros.model.schema import ParameterError, RunError
 
 BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
 READY = 'ready'         # begin of a bridge's state
-CONTROLLER = 'control_nodes:ControllerNode'
+CONTROLLER = 'nodes:ControllerNode'
 # Executable -> module of this folder and class.
-NODES = {'sim_node': 'sim_node:SimNode', 'ekf_node': 'control_nodes:EkfNode',
+NODES = {'sim_node': 'sim_node:SimNode', 'ekf_node': 'nodes:EkfNode',
          'nmpc_node': CONTROLLER, 'rl_node': CONTROLLER,
-         'supervisor_node': 'control_nodes:SupervisorNode',
+         'supervisor_node': 'nodes:SupervisorNode',
          'joint_bridge_node': 'bridge_nodes:JointBridgeNode',
          'rotor_bridge_node': 'bridge_nodes:RotorBridgeNode',
-         'reference_node': 'side_nodes:ReferenceNode', 'recorder_node': 'side_nodes:RecorderNode',
-         'viewer_node': 'side_nodes:ViewerNode'}
+         'reference_node': 'nodes:ReferenceNode', 'recorder_node': 'nodes:RecorderNode',
+         'viewer_node': 'nodes:ViewerNode'}
 # Parameter autostart of a bridge -> lifecycle state to reach.
 AUTOSTART = {'none': '', 'configure': 'inactive', 'activate': 'active'}
 COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes

@@ -21,7 +21,7 @@ from beetle_omni_ros.bags.conversions import seconds as seconds_of
 from beetle_omni_ros.bags.messages import Diagnostic, MessageError
 from beetle_omni_ros.bags.topics import ALL, LOG, Qos, SENSOR, TARGETS
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.drivers import findings
+from beetle_omni_ros.drivers import check
 from beetle_omni_ros.model.mode import DISARMED, Mode
 from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.ros import runner, wire
@@ -246,17 +246,17 @@ class Operator(Client):
 
 # --- beetle_omni check --------------------------------------------------------------------------
 
-def listen(seconds: float, namespace: str = '') -> findings.ObservedGraph:
+def listen(seconds: float, namespace: str = '') -> check.ObservedGraph:
     """Record the traffic of a graph for ``seconds``; publishes nothing."""
     client = Client('check', namespace=namespace)
     node = client._node
     try:
-        graph = findings.ObservedGraph(client.domain, seconds,
-                                       {topic: findings.Stream() for topic in SENSORS})
+        graph = check.ObservedGraph(client.domain, seconds,
+                                       {topic: check.Stream() for topic in SENSORS})
         for topic in SENSORS:
             wire.subscribe_raw(node, topic, partial(
                 _observe, node, ALL[topic], graph.streams[topic]), LOG)
-        for bridge in findings.BRIDGES:
+        for bridge in check.BRIDGES:
             wire.subscribe(node, f'{bridge}/state', partial(graph.states.__setitem__, bridge))
         wire.subscribe(node, 'diagnostics', lambda statuses: graph.diagnostics.update(
             (status.name, status) for status in statuses))

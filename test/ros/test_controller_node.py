@@ -12,7 +12,7 @@ from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.readings import JointReading
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.ros import graph
-from beetle_omni_ros.ros.control_nodes import SupervisorNode
+from beetle_omni_ros.ros.nodes import SupervisorNode
 from beetle_omni_ros.ros.runner import maker
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
