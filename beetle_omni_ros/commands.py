@@ -11,8 +11,7 @@ from typer import Argument, echo, Option
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, OWNER
-from beetle_omni_ros.identify_commands import identify
-from beetle_omni_ros.improve import improve
+from beetle_omni_ros.identify_commands import gap, identify, improve
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.options import (
     Commands,
@@ -31,7 +30,6 @@ from beetle_omni_ros.options import (
     NmpcOption,
     one_of,
     OutputOption,
-    PageOption,
     PlantOption,
     PolicyOption,
     RobotOption,
@@ -271,47 +269,8 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
     run_view(runs, **page)
 
 
-@app.command()
-def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
-            'Recorded flights: bags, or with --format tables; or logs of the joints (CSV, or bags '
-            'with only joint_states and command).'))],
-        holdout: Annotated[list[Path], Option(metavar='RUN...', help=(
-            'Flights for validation only. Default: the last of three bags or more.'))] = (),
-        robot: TheRobotOption = None,
-        apply: Annotated[Path | None, Option(callback=writable, metavar='FILE', help=(
-            'Write a robot file with the named effects.'))] = None,
-        page: PageOption = None,
-        parameters: Annotated[Path | None, Option('--gap', metavar='FILE', help=(
-            'File with changes to params/gap.yaml.'))] = None,
-        fix: Annotated[bool, Option('--fix', help=(
-            'Correct damaged recordings if the correction is certain; the bags stay '
-            'unchanged.'))] = False,
-        tolerances: Annotated[bool, Option('--tolerances', help=(
-            "With --apply: also write this robot's own mass, inertia, gains, lags and rotor "
-            'positions, as fitted within tolerance.'))] = False,
-        form: Annotated[str | None, Option('--format', metavar='NAME|FILE', help=(
-            'Flights are tables (CSV, .gz) with the columns of this format: nanobench, '
-            'crazypad_motor, or a YAML file.'))] = None,
-        alpha: Annotated[float, Option(metavar='P', help=(
-            'Accepted probability of a false alarm.'))] = 0.05,
-        next_task: Annotated[Path | None, Option(
-            '--next', callback=writable, metavar='FILE', help=(
-                'Write a task (YAML) that decides between the candidates, for fly and '
-                'evaluate.'))] = None,
-        json_path: JsonOption = None):
-    """
-    Identify and add effects that the model lacks from flights.
-
-    Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
-    """
-    from beetle_omni_ros.flight.experiment import Experiments
-    from beetle_omni_ros.identify.flights.command import run_gap
-    return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
-                   tolerances=tolerances, form=form, alpha=alpha, next_task=next_task,
-                   experiments=Experiments)
-
-
-app.command()(improve)
+for command in (gap, improve):
+    app.command()(command)
 
 
 @app.command()
