@@ -1,6 +1,6 @@
 """`beetle_omni fly`: fly the ROS graph, record a bag, and print the results from the bag."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import contextmanager, ExitStack
 from functools import partial
 from pathlib import Path
@@ -51,18 +51,15 @@ PACING = 'sim_node: pacing'
 FILM = 'flight.html'        # of --view, in the folder of the bag
 
 
-def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
-            bag: Path, seed: int = 0, conditions: str = 'nominal',
-            actuators: str | None = None, clock: str = 'auto',
-            robot: Path | None = None, plant: Path | None = None, nmpc: Path | None = None,
-            policy: Path | None = None, standby: bool = True,
+def run_fly(*, bag: Path, controller: str = registry.DEFAULT, task: str = 'waypoints',
+            robot: Path | None = None, plant: Path | None = None, seed: int = 0,
             faults: Path | None = None, json_path: Path | None = None,
-            components: Sequence[str] = (), domain_id: int | None = None, view: bool = False,
-            full: bool = False, console: Console | None = None) -> int:
+            domain_id: int | None = None, view: bool = False, full: bool = False,
+            console: Console | None = None, **more) -> int:
     """
     Fly a task through the ROS graph and print the results of the bag.
 
-    Arguments are the options of `beetle_omni fly`.
+    Arguments are the options of `beetle_omni fly`; ``more`` are those of the graph alone.
 
     Returns:
         Exit status: 0 flown to the end, 1 not.
@@ -75,54 +72,55 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
     with ExitStack() as stack:
         stack.enter_context(runner.sigterm_as_interrupt())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
-        given, bag = Path(bag), Path(bag).absolute()
         check_new(bag)
         flown_task = make_task(task, seed, registry.find(controller).reach(
             RobotParameters.load(robot)))
-        RobotParameters.load(plant or robot)
         injected = load_faults(faults) if faults else []
-        planned = partial(
-            plan, controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
-            standby=standby, robot_file=_absolute(robot and find_robot(robot)),
-            plant_file=_absolute(plant and find_robot(plant)),
-            conditions=conditions, seed=int(seed),
-            task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-            ports=str(folder), actuators=_checked(injected, actuators), components=components)
-        nodes, left_out = planned(clock='system' if clock == 'auto' else clock)
-        if clock == 'auto':
-            clock = _clock(nodes, robot, actuators, console)
-            nodes, left_out = planned(clock=clock)
-        nodes['sim_node']['task_faults'] = '; '.join(map(str, injected))
-        if clock == 'simulated':    # it begins when all nodes are there
-            nodes['sim_node']['pause_at'] = 0.0
-        for name, reason in left_out.items():
-            _print(console, f'{name} does not stand by: {reason}')
-        controller = registry.find(controller).name
+        nodes, clock = _planned(console, folder, controller, task, bag, robot, plant, seed,
+                                injected, **more)
         number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
         if view:
             stack.enter_context(viewer_process(number, console))
         else:
             _print(console, f'to watch: beetle_omni view --domain-id {number}')
-        meta = {'task': task, 'conditions': conditions, 'seed': seed,
+        meta = {'task': task, 'conditions': nodes['sim_node']['conditions'], 'seed': seed,
                 'robot': str(robot) if robot else 'params/robot.yaml',
                 'plant': str(plant) if plant else None, 'version': __version__,
-                'controller': controller, 'clock': clock,
+                'controller': registry.find(controller).name, 'clock': clock,
                 'actuators': nodes['sim_node'].get('actuators', 'direct'),
                 **({'faults': [str(fault) for fault in injected]} if injected else {})}
         graph = Graph(nodes, folder, number)
         failure = slow = ''
         try:
-            failure, slow = _fly(graph, controller, flown_task, console, clock == 'simulated')
+            failure, slow = _fly(graph, meta['controller'], flown_task, console,
+                                 clock == 'simulated')
         except KeyboardInterrupt:
             meta['interrupted'] = True
-        log = given / LOG if bag.is_dir() else given.with_name(f'{bag.name}.log')
-        write_text(log, ''.join(f'{line}\n' for line in graph.lines()), 'log')
-        try:
-            return _conclude(bag, flown_task, meta, failure, slow, json_path, console, full, view)
-        finally:
-            film = given / FILM
-            print_end(console, [given, log, *([film] if film.exists() else []), json_path],
-                      *([('report', given), ('view', given)] if bag.exists() else ()))
+        return _conclude(graph, Path(bag), flown_task, meta, failure, slow, json_path, console,
+                         full, view)
+
+
+def _planned(console, folder, controller, task, bag, robot, plant, seed, faults, *,
+             nmpc=None, policy=None, standby=True, conditions='nominal', actuators=None,
+             clock='auto', components=()):
+    """Nodes of a flight with their parameters, and its clock."""
+    RobotParameters.load(plant or robot)
+    planned = partial(
+        plan, controller, nmpc=_absolute(nmpc), policy=str(policy or ''), standby=standby,
+        robot_file=_absolute(robot and find_robot(robot)),
+        plant_file=_absolute(plant and find_robot(plant)), conditions=conditions, seed=int(seed),
+        task=_absolute(task) if Path(task).is_file() else str(task), bag=_absolute(bag),
+        ports=str(folder), actuators=_checked(faults, actuators), components=components)
+    nodes, left_out = planned(clock='system' if clock == 'auto' else clock)
+    if clock == 'auto':
+        clock = _clock(nodes, robot, actuators, console)
+        nodes, left_out = planned(clock=clock)
+    nodes['sim_node']['task_faults'] = '; '.join(map(str, faults))
+    if clock == 'simulated':    # it begins when all nodes are there
+        nodes['sim_node']['pause_at'] = 0.0
+    for name, reason in left_out.items():
+        _print(console, f'{name} does not stand by: {reason}')
+    return nodes, clock
 
 
 def _clock(nodes, robot, actuators, console):
@@ -139,20 +137,26 @@ def _clock(nodes, robot, actuators, console):
     return 'system'
 
 
-def _conclude(bag: Path, task: Task, meta: dict, failure: str, slow: str,
-              json_path: Path | None, console: Console, full: bool, film: bool) -> int:
+def _conclude(graph, bag, task, meta, failure, slow, json_path, console, full, film) -> int:
     """Report the flight of a bag and why it failed; return the exit status."""
-    if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
-        result = _report(bag, meta['controller'], task, meta, json_path, console, full, film)
-        failure = failure or failed(result)
-    if 'interrupted' in meta:
-        if bag.exists():
-            _print(console, 'interrupted; kept what was flown')
-        raise KeyboardInterrupt
-    if failure:
-        _complain(failure + slow)
-    elif slow:
-        _print(console, slow.removeprefix('; '), style='yellow')
+    log = bag / LOG if bag.is_dir() else bag.with_name(f'{bag.name}.log')
+    write_text(log, ''.join(f'{line}\n' for line in graph.lines()), 'log')
+    try:
+        if bag.exists() and not failure.startswith(str(bag.absolute())):    # of the recorder
+            result = _report(bag, meta['controller'], task, meta, json_path, console, full, film)
+            failure = failure or failed(result)
+        if 'interrupted' in meta:
+            if bag.exists():
+                _print(console, 'interrupted; kept what was flown')
+            raise KeyboardInterrupt
+        if failure:
+            _complain(failure + slow)
+        elif slow:
+            _print(console, slow.removeprefix('; '), style='yellow')
+    finally:
+        page = bag / FILM
+        print_end(console, [bag, log, *([page] if page.exists() else []), json_path],
+                  *([('report', bag), ('view', bag)] if bag.exists() else ()))
     return runner.FAILED if failure else runner.OK
 
 
