@@ -7,20 +7,7 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-from beetle_omni_ros.options import (
-    Commands,
-    JobsOption,
-    JsonOption,
-    PageOption,
-    ParamsOption,
-    PlantOption,
-    RateOption,
-    SeedOption,
-    several,
-    TaskOption,
-    TheRobotOption,
-    writable,
-)
+from beetle_omni_ros import options
 
 
 def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
@@ -28,10 +15,10 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
             'with only joint_states and command).'))],
         holdout: Annotated[list[Path], Option(metavar='RUN...', help=(
             'Flights for validation only. Default: the last of three bags or more.'))] = (),
-        robot: TheRobotOption = None,
-        apply: Annotated[Path | None, Option(callback=writable, metavar='FILE', help=(
+        robot: options.TheRobotOption = None,
+        apply: Annotated[Path | None, Option(callback=options.writable, metavar='FILE', help=(
             'Write a robot file with the named effects.'))] = None,
-        page: PageOption = None,
+        page: options.PageOption = None,
         parameters: Annotated[Path | None, Option('--gap', metavar='FILE', help=(
             'File with changes to params/gap.yaml.'))] = None,
         fix: Annotated[bool, Option('--fix', help=(
@@ -46,10 +33,10 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
         alpha: Annotated[float, Option(metavar='P', help=(
             'Accepted probability of a false alarm.'))] = 0.05,
         next_task: Annotated[Path | None, Option(
-            '--next', callback=writable, metavar='FILE', help=(
+            '--next', callback=options.writable, metavar='FILE', help=(
                 'Write a task (YAML) that decides between the candidates, for fly and '
                 'evaluate.'))] = None,
-        json_path: JsonOption = None):
+        json_path: options.JsonOption = None):
     """
     Identify and add effects that the model lacks from flights.
 
@@ -69,16 +56,16 @@ def improve(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
                 'continues.'))],
             holdout: Annotated[list[Path], Option(metavar='RUN...', help=(
                 'Flights for validation only. Default: the last of three bags or more.'))] = (),
-            robot: TheRobotOption = None,
-            plant: PlantOption = None,
+            robot: options.TheRobotOption = None,
+            plant: options.PlantOption = None,
             controllers: Annotated[str, Option(
-                '--controllers', '--controller', callback=several, metavar='NAME,...',
+                '--controllers', '--controller', callback=options.several, metavar='NAME,...',
                 help='Controllers that fly with both files.')] = 'nmpc,rl',
-            task: TaskOption = 'random10',
+            task: options.TaskOption = 'random10',
             flights: Annotated[int, Option(min=1, metavar='N', help=(
                 'Flights of each controller with each file.'))] = 3,
-            seed: SeedOption = 0,
-            jobs: JobsOption = None,
+            seed: options.SeedOption = 0,
+            jobs: options.JobsOption = None,
             alpha: Annotated[float, Option(metavar='P', help=(
                 'Accepted probability of a false alarm.'))] = 0.05):
     """
@@ -119,7 +106,7 @@ def improve(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
     return 3 if found['verdict'] == 'bad_data' else 0
 
 
-identify = Commands(help='Fit the actuator models from measured data.')
+identify = options.Commands(help='Fit the actuator models from measured data.')
 
 
 def _run(what, **options):
@@ -132,8 +119,8 @@ def joint(paths: Annotated[list[Path], Argument(metavar='LOG...', help=(
               'Response logs (CSV) or recorded run (bag), see docs/how-to/identification.md.'))],
           validate: Annotated[list[Path], Option(metavar='LOG.csv...', help=(
               'Further logs for validation.'))] = (),
-          robot: TheRobotOption = None, report: PageOption = None, params: ParamsOption = None,
-          json_path: JsonOption = None):
+          robot: options.TheRobotOption = None, report: options.PageOption = None,
+          params: options.ParamsOption = None, json_path: options.JsonOption = None):
     """
     Fit one servo model to response logs; the last 40 % validate it.
 
@@ -151,9 +138,9 @@ def rotor(paths: Annotated[list[Path], Argument(metavar='LOG.csv...', help=(
                                                help=(
               'Column of a quantity with sign and factor to SI units, e.g. thrust=-fz or '
               'thrust=load_g*0.00981; may be repeated.'))] = (),
-          rate: RateOption = None,
-          robot: TheRobotOption = None, report: PageOption = None, params: ParamsOption = None,
-          json_path: JsonOption = None):
+          rate: options.RateOption = None,
+          robot: options.TheRobotOption = None, report: options.PageOption = None,
+          params: options.ParamsOption = None, json_path: options.JsonOption = None):
     """
     Fit thrust, torque and lag of a rotor to logs of a stand.
 
@@ -169,9 +156,9 @@ def robot(paths: Annotated[list[Path], Argument(metavar='LOG...', help=(
               'Response logs of the joints (CSV or bag) and logs of a force-torque stand, '
               'recognised by their header.'))],
           params: Annotated[Path, Option(
-              callback=writable, metavar='FILE', help='The robot file to write.')],
-          rate: RateOption = None, robot: TheRobotOption = None, report: PageOption = None,
-          json_path: JsonOption = None):
+              callback=options.writable, metavar='FILE', help='The robot file to write.')],
+          rate: options.RateOption = None, robot: options.TheRobotOption = None,
+          report: options.PageOption = None, json_path: options.JsonOption = None):
     """
     Write a robot file with intervals from logs of servos and rotors.
 

@@ -12,15 +12,7 @@ from PIL import Image
 
 from beetle_omni_ros.bags.metrics import L_WINDOW, U_WINDOW
 from beetle_omni_ros.control.tasks import make_task, POSE_DURATION, RISING, TILTS
-from beetle_omni_ros.flight.summary import (
-    kind_of,
-    look,
-    METRICS,
-    PRINTED,
-    printed,
-    PUBLISHED,
-    task_title,
-)
+from beetle_omni_ros.flight import summary
 from beetle_omni_ros.show import figures
 from beetle_omni_ros.show.figures import FAINT, INK, legend, panels
 from beetle_omni_ros.show.page import ABSENT, Grid, number
@@ -53,7 +45,7 @@ def convergence(groups: Groups, task: str) -> Figure:
     figure, axes = panels(1, 2, height=2.8)
     grid = np.arange(0.0, POSE_DURATION, STEP)
     for k, (name, results) in enumerate(groups.items()):     # the first is on top
-        style = look(name)
+        style = summary.look(name)
         for panel, (what, floor) in zip(axes[0], FLOOR.items(), strict=True):
             folded = _folded(results, f'{what}_error', grid)
             if not len(folded):
@@ -122,7 +114,7 @@ def _levels(panel, task):
 
 def _error_curve(panel, result, what, name, height):
     """Plot one flight's errors, mark lost control, and return the largest error."""
-    style, trace = look(name), result['trace']
+    style, trace = summary.look(name), result['trace']
     t, values = trace['t'], trace[f'{what}_error']
     panel.plot(t, values, color=style.colour, ls=style.dashes, lw=1.5, label=style.label,
                zorder=height)
@@ -190,12 +182,13 @@ def table(results: dict, task: str, conditions: str, brief: bool = False) -> Gri
     """Every metric of a task: mean with interval, unless brief also differences and ranges."""
     numbers = results['summary']['tasks'][task][conditions]
     ours = [name for name in results['meta']['controllers'] if name in numbers['flights']]
-    kind = kind_of(task)
-    paper = list(PUBLISHED) if kind in PRINTED else []
+    kind = summary.kind_of(task)
+    paper = list(summary.PUBLISHED) if kind in summary.PRINTED else []
     rows: list[list[str]] = []
     best: set[tuple[int, int]] = set()
-    for key, metric in METRICS[kind].items():
-        of, given = numbers['metrics'][key], [printed(task, metric, name) for name in paper]
+    for key, metric in summary.METRICS[kind].items():
+        of = numbers['metrics'][key]
+        given = [summary.printed(task, metric, name) for name in paper]
         most = max(of[name]['count'] for name in ours)
         best |= {(len(rows), column) for column, name in enumerate(ours, 1) if of[name]['best']}
         rows.append([metric.title, *(
@@ -222,11 +215,11 @@ def table(results: dict, task: str, conditions: str, brief: bool = False) -> Gri
                               len(numbers['flights'][name]['seeds'])) for name in ours),
             *(ABSENT for _ in paper)])
     seeds = sorted({seed for name in ours for seed in numbers['flights'][name]['seeds']})
-    real = 'real robot' if PRINTED.get(kind, (0, False))[1] else 'Gazebo'
+    real = 'real robot' if summary.PRINTED.get(kind, (0, False))[1] else 'Gazebo'
     return Grid(
-        f'{task_title(task)}, {conditions} conditions',
-        ['', *(look(name).label for name in ours),
-         *(f'{look(name).label} (published, {real})' for name in paper)],
+        f'{summary.task_title(task)}, {conditions} conditions',
+        ['', *(summary.look(name).label for name in ours),
+         *(f'{summary.look(name).label} (published, {real})' for name in paper)],
         rows, best=frozenset(best), faint_columns=frozenset(range(len(ours) + 1, len(rows[0]))),
         note=' '.join([f"Seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}.",
                        *([] if brief else [NOTES['intervals'].format(
@@ -239,17 +232,17 @@ def glance(results: dict) -> Grid:
     rows: list[list[str]] = []
     best = set()
     for task, by_conditions in results['summary']['tasks'].items():
-        real = ' *' * PRINTED.get(kind_of(task), (0, False))[1]
+        real = ' *' * summary.PRINTED.get(summary.kind_of(task), (0, False))[1]
         for conditions, numbers in by_conditions.items():
-            for key, metric in METRICS[kind_of(task)].items():
+            for key, metric in summary.METRICS[summary.kind_of(task)].items():
                 if not metric.glance:
                     continue
                 of = numbers['metrics'][key]
                 best |= {(len(rows), k) for k, name in enumerate(ours, 1)
                          if name in of and of[name]['best']}
-                given = [printed(task, metric, name) if conditions == 'nominal' else {}
-                         for name in PUBLISHED]
-                rows.append([f'{task_title(task)}, {conditions}: {metric.title}', *(
+                given = [summary.printed(task, metric, name) if conditions == 'nominal' else {}
+                         for name in summary.PUBLISHED]
+                rows.append([f'{summary.task_title(task)}, {conditions}: {metric.title}', *(
                     number(of[name]['mean'], metric.digits) if name in of else ABSENT
                     for name in ours), *(
                     number(entry.get('mean'), None) + real * bool(entry) for entry in given)])
@@ -257,10 +250,10 @@ def glance(results: dict) -> Grid:
         number(results['summary']['compute_ms'].get(name), 3) for name in ours),
         *(f'{text} *' for text in COMPUTED)])
     return Grid('All experiments', [
-        '', *(look(name).label for name in ours),
-        *(f'{look(name).label} (published)' for name in PUBLISHED)], rows, note=NOTES['glance'],
-        best=frozenset(best),
-        faint_columns=frozenset(range(len(ours) + 1, len(ours) + len(PUBLISHED) + 1)))
+        '', *(summary.look(name).label for name in ours),
+        *(f'{summary.look(name).label} (published)' for name in summary.PUBLISHED)], rows,
+        note=NOTES['glance'], best=frozenset(best),
+        faint_columns=frozenset(range(len(ours) + 1, len(ours) + len(summary.PUBLISHED) + 1)))
 
 
 def sections(results: dict, flown: dict) -> list[Section]:
@@ -279,12 +272,13 @@ def sections(results: dict, flown: dict) -> list[Section]:
             for conditions in by_conditions:
                 blocks.append(table(results, task, conditions))
                 groups = results_with_trace(flown, task, conditions)
-                for name, caption, draw in DRAWN.get(kind_of(task), ()):
+                for name, caption, draw in DRAWN.get(summary.kind_of(task), ()):
                     if groups and (figure := draw(groups, task)):
-                        blocks.append(Picture(f'{kind_of(task)}_{name}_{conditions}',
+                        blocks.append(Picture(f'{summary.kind_of(task)}_{name}_{conditions}',
                                               f'{caption} ({conditions} conditions)',
                                               png(figure)))
-            made.append(Section(task_title(task), TEXTS['texts'].get(kind_of(task), ''), blocks))
+            made.append(Section(summary.task_title(task),
+                                TEXTS['texts'].get(summary.kind_of(task), ''), blocks))
     return made
 
 
@@ -302,8 +296,8 @@ def content(results: dict, made: list[Section]) -> dict:
     meta = results['meta']
     terms = []
     for name in meta['controllers']:
-        what = look(name).text or meta['specs'].get(name, '')
-        terms.append((look(name).label, f"{what}; guidance: {meta['guidance'][name]}"))
+        what = summary.look(name).text or meta['specs'].get(name, '')
+        terms.append((summary.look(name).label, f"{what}; guidance: {meta['guidance'][name]}"))
     terms += [(f'{name} conditions', TEXTS['conditions'][name]) for name in meta['conditions']]
     terms += [(f'{name}: not flown', reason) for name, reason in meta['skipped'].items()]
     failed = sum(bool(flight['failure']) for flight in results['flights'])
@@ -313,7 +307,7 @@ def content(results: dict, made: list[Section]) -> dict:
              f"{', '.join(map(str, meta['seeds']))}",
              f"{meta['cpu_s'] / 60:.1f} core minutes on {meta['processor']}",
              *([f"simulated plant: {meta['plant']}"] if meta['plant'] else []),
-             *(f'{look(name).label}: policy {digest}'
+             *(f'{summary.look(name).label}: policy {digest}'
                for name, digest in meta['policies'].items())]
     flights = Grid('', ['task', 'conditions', 'controller', 'seed', 'end', 'core s'], [
         [flight['task'], flight['conditions'], flight['controller'], str(flight['seed']),
