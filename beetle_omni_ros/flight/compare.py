@@ -54,7 +54,8 @@ class ComparedFlight:
     seed: int           # of the task's poses and of the simulation
     policy: str = ''    # file in place of its shipped policy, '' for none
     spec: str = ''      # reference to its class, '' for a registered controller
-    plant: str = ''     # robot file of the simulated plant, '' for the shipped one
+    plant: str = ''     # robot file of the simulated plant, '' for that of ``robot``
+    robot: str = ''     # robot file of estimator and controller, '' for the shipped one
 
     @property
     def name(self) -> str:
@@ -68,6 +69,7 @@ class ComparedFlight:
         return campaign.flight_key(
             fly_flight, self.reference, self.conditions, str(self.seed),
             campaign.file_digest(self.task) if Path(self.task).is_file() else self.task,
+            RobotParameters.load(self.robot).hash() if self.robot else '',
             policy=self.policy, plant=self.plant)
 
     @cached_property
@@ -119,7 +121,7 @@ def fly_flight(flight: ComparedFlight, task: Task) -> dict:
     start = time.process_time()
     result = {'failure': None, 'metrics': None, 'trace': {}, 'host': platform.node()}
     try:
-        robot = RobotParameters.load()
+        robot = RobotParameters.load(flight.robot or None)
         with warnings.catch_warnings():
             # An unstable flight may overflow; its metrics show the failure.
             warnings.simplefilter('ignore', RuntimeWarning)

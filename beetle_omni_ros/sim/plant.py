@@ -162,7 +162,8 @@ class Plant:
         """Advance one tick with the present targets; a RunError reports a diverged state."""
         model, data = self.model, self.data
         if self._loads.active:
-            self._load_servos()
+            self._target[:], load = self._loads(self._commanded_tilt, self._scale * data.act)
+            data.qfrc_applied[6:] = load + self._friction
         touching, fast = self._near_limits()
         model.opt.disableflags = self._flags if touching else self._flags | NO_CONSTRAINT
         substeps = min(FLOOR_SUBSTEPS, self._substeps) if fast and data.ncon else self._substeps
@@ -243,11 +244,6 @@ class Plant:
             position=self._qpos[:3], velocity=motion[:3], rate=motion[3:6], tilt=tilt,
             tilt_rate=motion[6:], thrust=thrust, thrust_rate=(commanded - thrust) / lag,
             voltage_ratio=self.voltage_ratio)
-
-    def _load_servos(self):
-        """Set servo targets and joint torques from the commands by the effects on servos."""
-        self._target[:], load = self._loads(self._commanded_tilt, self._scale * self.data.act)
-        self.data.qfrc_applied[6:] = load + self._friction
 
     def _rub(self, others):
         """
