@@ -21,9 +21,9 @@ from beetle_omni_ros.bags.messages import Diagnostic, MessageError, new, Wrench
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.model import readings, rotations
 from beetle_omni_ros.model.allocation import ActuatorHealth
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.mode import Mode
 from beetle_omni_ros.model.parameters import JOINT_NAMES, ROTOR_NAMES
+from beetle_omni_ros.model.rotations import BodyState
 
 WORLD, BODY = 'world', 'base_link'
 JOINTS, ROTORS = list(JOINT_NAMES), list(ROTOR_NAMES)

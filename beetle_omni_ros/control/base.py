@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from beetle_omni_ros.model.allocation import ActuatorHealth, ALL_HEALTHY, NO_ZEROS, ROTORS
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.mode import FLYING, Mode
+from beetle_omni_ros.model.rotations import BodyState
 
 AT_REST = np.zeros(3)           # velocity of a pose
 AT_REST.flags.writeable = False

@@ -15,8 +15,8 @@ from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 from beetle_omni_ros.model.mode import COMMAND_AGE, DISARMED, Mode, MOTORS_OFF
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.parts import ThrustMap
 from beetle_omni_ros.model.readings import BatteryReading
-from beetle_omni_ros.model.thrust_map import ThrustMap
 
 TICK = 0.01             # [s] longest sleep of the thread, a tenth of its shortest period
 CORRECTION = 50_000     # [us] a larger backward step of the board's clock is a restart

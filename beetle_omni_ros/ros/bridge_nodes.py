@@ -9,9 +9,8 @@ from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_xc330 import ServoBusError
 from beetle_omni_ros.flight import bridges
 from beetle_omni_ros.model.schema import parameter
-from beetle_omni_ros.ros import parameters
 from beetle_omni_ros.ros.graph import AUTOSTART
-from beetle_omni_ros.ros.node import FlightNode
+from beetle_omni_ros.ros.node import file_parameter, FlightNode
 
 RETRY = 1.0             # [s] between attempts to start by itself
 
@@ -28,7 +27,7 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
 
     def __init__(self, name, *args, autostart):
         FlightNode.__init__(
-            self, name, *args, robot_file=parameters.file_parameter(), autostart=parameter(
+            self, name, *args, robot_file=file_parameter(), autostart=parameter(
                 autostart, choices=tuple(AUTOSTART),
                 doc='transition at the start, repeated until it succeeds'))
         LifecycleNodeMixin.__init__(self)

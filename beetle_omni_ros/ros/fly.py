@@ -1,24 +1,28 @@
 """`beetle_omni fly`: fly the ROS graph, record a bag, and print the results from the bag."""
 
 from collections.abc import Callable
-from contextlib import contextmanager, ExitStack
+from contextlib import contextmanager, ExitStack, suppress
 from functools import partial
+import os
 from pathlib import Path
+from statistics import median
 import subprocess
 import sys
 import tempfile
+import time
 
 from rich.console import Console
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.bags.bag_writer import add_meta, check_new
-from beetle_omni_ros.bags.log import motion
+from beetle_omni_ros.bags.log import motion, Recorder
 from beetle_omni_ros.bags.metrics import failed, metrics
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.control.tasks import make_task, Task
-from beetle_omni_ros.flight.component import ERROR
-from beetle_omni_ros.flight.loop import ARMING_TIME
+from beetle_omni_ros.flight.component import ERROR, made
+from beetle_omni_ros.flight.loop import ARMING_TIME, collector_off, FlightLoop
 from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import find_robot, RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
@@ -27,12 +31,15 @@ from beetle_omni_ros.ros.graph import (
     BRIDGES,
     child_environment,
     COMPOSED,
+    CONTROLLER,
     Graph,
+    NODES,
+    Parameters,
     plan,
     reserved_domain,
 )
 from beetle_omni_ros.ros.operator import NEVER, Operator
-from beetle_omni_ros.ros.pace import too_slow
+from beetle_omni_ros.ros.runner import REAL_TIME_PRIORITY
 from beetle_omni_ros.show import table
 from beetle_omni_ros.show.page import print_end
 from beetle_omni_ros.sim.faults import DEVICES, load_faults
@@ -326,3 +333,59 @@ def _report(bag, controller, task, meta, json_path, console, full, film) -> dict
         from beetle_omni_ros.show.recorded import recorded_scene  # viser takes a second
         write_text(bag / FILM, recorded_scene({controller: log}), 'film')
     return results[controller]
+
+
+# Time of the graph's process, in times of the loop: messages and callbacks in Python. Measured
+# by benchmarks/graph.py, see docs/results/ros_graph.md.
+GRAPH = 4.0
+MOST = 0.95         # of a core that the graph's process may need
+CORES = 2           # one for the graph, one for bridges, operator, viewer and browser
+WINDOW, WINDOWS = 0.25, 7   # [s] of simulated time; the median of the windows counts
+
+
+def too_slow(nodes: Parameters, robot: Path | None) -> tuple[float, str]:
+    """
+    Return the share of a core that a graph in real time needs, and why it is too much, or ''.
+
+    The controllers, the estimator, the supervisor and the simulator of ``nodes`` fly in the loop
+    for a moment, with the priority of the graph. A ParameterError reports an unusable controller.
+    """
+    share = GRAPH * _time_of_loop(_loop(nodes, RobotParameters.load(robot)))
+    cores = len(os.sched_getaffinity(0))
+    if cores < CORES:
+        return share, f'real time needs {CORES} cores, this computer has {cores}'
+    if share > MOST:
+        return share, ('this computer is too slow for real time: the flight needs '
+                       f'{100 * share:.0f} % of a core, expected at most {100 * MOST:.0f} %')
+    return share, ''
+
+
+def _loop(nodes, robot):
+    """The nodes' flight in one process."""
+    aboard, components = {}, []
+    for name, values in nodes.items():
+        if 'component' in values:
+            components.append(values['component'])
+        elif NODES.get(name, CONTROLLER) == CONTROLLER:
+            entry = registry.find(values.get('controller') or name.removesuffix('_node'))
+            aboard[entry.name] = entry.make(robot, ControllerOptions(
+                parameters=values.get(f'{entry.name}_file'), policy=values.get('policy')))
+    return FlightLoop(robot, robot, aboard, Recorder(), others=made(components, robot))
+
+
+def _time_of_loop(loop):
+    """Time of a simulated second in flight, at real-time priority if the system permits it."""
+    times, before = [], (os.sched_getscheduler(0), os.sched_getparam(0))
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(REAL_TIME_PRIORITY))
+    try:
+        with collector_off():
+            with suppress(RunError):    # the graph reports it
+                loop.take_off()
+            for _ in range(WINDOWS):
+                begin = time.perf_counter()
+                loop.run(WINDOW)
+                times.append(time.perf_counter() - begin)
+    finally:
+        os.sched_setscheduler(0, *before)
+    return median(times) / WINDOW

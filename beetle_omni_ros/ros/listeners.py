@@ -136,8 +136,7 @@ class LiveGraph(Client):
 def run_live(*, namespace: str = '', domain_id: int | None = None,
              host: str, port: int) -> None:
     """Show a running graph until Ctrl-C, by default that of the only domain in use."""
-    from beetle_omni_ros.show.live import draw
-    from beetle_omni_ros.show.recorded import announce
+    from beetle_omni_ros.show.recorded import announce, draw
     from beetle_omni_ros.show.scene import close, serve
     runner.end_with_parent()
     if domain_id is None and not os.environ.get('ROS_DOMAIN_ID') and len(domains_in_use()) == 1:

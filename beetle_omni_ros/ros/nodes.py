@@ -17,8 +17,7 @@ from beetle_omni_ros.flight.surroundings import TaskReference
 from beetle_omni_ros.model.schema import parameter, ParameterError, RunError
 from beetle_omni_ros.ros import wire
 from beetle_omni_ros.ros.graph import NODES
-from beetle_omni_ros.ros.node import FlightNode
-from beetle_omni_ros.ros.parameters import file_parameter
+from beetle_omni_ros.ros.node import file_parameter, FlightNode
 from beetle_omni_ros.supervisor.interface import SupervisorParameters
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.model import readings, rotations
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.rotations import BodyState
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.parameters import Conditions, RPM_AT_1_NEWTON, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant

@@ -136,7 +136,7 @@ def delayed(history: torch.Tensor, delay: torch.Tensor) -> torch.Tensor:
 def acting(sent: torch.Tensor, delay: torch.Tensor) -> tuple[tuple[torch.Tensor, ...],
                                                              torch.Tensor]:
     """
-    Three commands (N, 8) of which :class:`train.physics.Physics` needs the delayed ones.
+    Three commands (N, 8) of which :class:`train.model.Physics` needs the delayed ones.
 
     Args:
         sent: (N, H, 8) commands, newest first.

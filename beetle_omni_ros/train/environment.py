@@ -23,9 +23,9 @@ from beetle_omni_ros.train.model import (
     MASS,
     module_reaction,
     nominal_body,
+    Physics,
 )
 from beetle_omni_ros.train.parameters import TrainParameters
-from beetle_omni_ros.train.physics import Physics
 from beetle_omni_ros.train.starts import (
     LONGEST_DELAY,
     MISSED_ATTITUDE,

@@ -8,8 +8,8 @@ from rclpy.parameter import Parameter
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.flight import component as base
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.readings import JointReading
+from beetle_omni_ros.model.rotations import BodyState
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.ros import graph
 from beetle_omni_ros.ros.nodes import SupervisorNode

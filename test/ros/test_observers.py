@@ -14,14 +14,14 @@ from beetle_omni_ros.bags.messages import Diagnostic, from_bytes
 from beetle_omni_ros.bags.topics import SENSOR
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.drivers.check import check_topics
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.readings import ImuReading, JointReading, PoseReading
+from beetle_omni_ros.model.rotations import BodyState
 from beetle_omni_ros.ros import listeners, wire
 from beetle_omni_ros.ros.graph import claim, domains_in_use
 from beetle_omni_ros.ros.listeners import Client, listen, LiveGraph
 from beetle_omni_ros.ros.nodes import ViewerNode
-from beetle_omni_ros.show.live import Newest
+from beetle_omni_ros.show.recorded import Newest
 
 pytestmark = pytest.mark.real_time
 UPRIGHT = np.array([0, 0, 0, 1.0])

@@ -16,8 +16,8 @@ pytest.importorskip('pymavlink')
 from beetle_omni_ros.drivers.mavlink import BOARD, common, HOST, MavlinkReceiver
 from beetle_omni_ros.flight.evaluate import run_evaluate
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.parts import duty_of_command, ThrustMap
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.model.thrust_map import duty_of_command, ThrustMap
 from beetle_omni_ros.sim.emulated import motor_board as firmware
 from beetle_omni_ros.sim.emulated.motor_board import BoardFirmware, library, NUMBERS
 from beetle_omni_ros.sim.simulator import Simulator

@@ -16,9 +16,9 @@ import numpy as np
 
 from beetle_omni_ros.model.native import built
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.parts import duty_of_command, ThrustMap
 from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import unknown
-from beetle_omni_ros.model.thrust_map import duty_of_command, ThrustMap
 from beetle_omni_ros.sim.emulated.device import BoardFaults, Device
 from beetle_omni_ros.sim.parameters import RPM_AT_1_NEWTON
 
