@@ -103,7 +103,7 @@ def evaluate(controllers: Annotated[str, Option(
                              f"{', '.join(controllers)}")
     given = {name: ControllerOptions(without=without) for name in controllers}
     for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
-        name = OWNER[option]
+        name = OWNER[key]
         if file and name not in controllers:
             raise ParameterError(f"{option} {file}: for the controller '{name}', which is not "
                                  f"among {', '.join(controllers)}")

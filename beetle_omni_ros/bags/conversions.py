@@ -283,11 +283,6 @@ def _take_joints(message):
     return readings.JointReading(seconds(message.header.stamp), position, velocity)
 
 
-def _read_command(message):
-    return Command(seconds(message.header.stamp), _of(message, 'position', JOINTS),
-                   _of(message, 'effort', ROTORS))
-
-
 JOINT = Form(JOINT_STATE, readings.JointReading, _read_joints, lambda value: _joint_state(
     value.stamp, value.names, position=value.position, velocity=value.velocity,
     effort=value.effort), _take_joints)
@@ -295,7 +290,9 @@ ROTOR = form(JOINT_STATE, readings.RotorReading, lambda message: readings.RotorR
     seconds(message.header.stamp), _of(message, 'velocity', ROTORS)),
     lambda value: _joint_state(value.stamp, ROTORS, velocity=value.speed))
 # Tilts are positions and thrusts are efforts; unused values are NaN.
-COMMAND = form(JOINT_STATE, Command, _read_command, lambda value: _joint_state(
+COMMAND = form(JOINT_STATE, Command, lambda message: Command(
+    seconds(message.header.stamp), _of(message, 'position', JOINTS),
+    _of(message, 'effort', ROTORS)), lambda value: _joint_state(
     value.stamp, COMMAND_NAMES, position=[*value.tilt, *NO_VALUE],
     effort=[*NO_VALUE, *value.thrust]), ('tilt', 'thrust'))
 

@@ -56,7 +56,6 @@ class ControllerEntry:
     description: str = ''
     parameters_file: str = ''   # shipped file of them; in the package's share, or any path
     policy_file: str = ''       # its network
-    option: str = ''        # of the command line, replaces the file of this controller only
     flies_degraded: bool = False    # with failed actuators
     stands_by: bool = False     # in the ROS graph
     compared: bool = False  # by default
@@ -132,12 +131,11 @@ _POLICY = 'beetle_omni_ros.control.policy:PolicyController'
 SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
     ControllerEntry(
         name='nmpc', label='NMPC', description='offset-free, params/nmpc.yaml', controller=_NMPC,
-        parameters_file='params/nmpc.yaml', option='--nmpc', flies_degraded=True, stands_by=True,
-        compared=True),
+        parameters_file='params/nmpc.yaml', flies_degraded=True, stands_by=True, compared=True),
     ControllerEntry(
         name='rl', label='RL', description='the learned policy, 33 observations',
         controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
-        option='--policy', stands_by=True, compared=True),
+        stands_by=True, compared=True),
     ControllerEntry(
         name='rl_bare', label='RL, bare', description='the learned policy without guidance',
         controller=_POLICY, parameters_file='params/rl_bare.yaml', policy_file='policies/rl.onnx',
@@ -175,8 +173,8 @@ DEFAULT = next(iter(SHIPPED))       # the default controller
 STANDING_BY = tuple(name for name, entry in SHIPPED.items() if entry.stands_by)
 COMPARED = sorted((name for name, entry in SHIPPED.items() if entry.compared),
                   key=lambda name: not SHIPPED[name].policy_file)      # policies first
-# Option of the command line -> controller whose file it replaces.
-OWNER = {entry.option: name for name, entry in SHIPPED.items() if entry.option}
+# Kind of a file -> controller for which programs accept another one.
+OWNER = {'parameters': 'nmpc', 'policy': 'rl'}
 _ADDED: dict[str, ControllerEntry] = {}     # of this process alone
 
 

@@ -99,7 +99,7 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
     for entry in conditions:
         if entry not in CONDITIONS:
             raise ParameterError(f"--conditions '{entry}': expected {' or '.join(CONDITIONS)}")
-    other = {registry.OWNER['--policy']: str(policy)} if policy else {}
+    other = {registry.OWNER['policy']: str(policy)} if policy else {}
     entries, flights = registry.find_all(controllers), []
     for task in tasks:
         duration = make_task(task).duration
@@ -230,7 +230,7 @@ def _available(names, policy, refuse):
     other one. With ``refuse`` the first reason is raised instead.
     """
     robot, available, skipped = RobotParameters.load(), {}, {}
-    learnt = registry.OWNER['--policy']
+    learnt = registry.OWNER['policy']
     for entry in registry.find_all(names):
         try:
             available[entry] = guidance_of(entry.make(robot, ControllerOptions(
