@@ -38,23 +38,13 @@ TRAJECTORY_TYPE = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 
 
 class Form(NamedTuple):
-    """
-    One kind of message.
+    """One kind of message."""
 
-    Attributes:
-        type: ROS message type.
-        value: class of its values.
-        read: message -> value; MessageError for another layout.
-        write: value -> message.
-        take: message -> value for use in flight; MessageError for unusable values.
-
-    """
-
-    type: str
-    value: type
-    read: Callable[[Any], Any]
-    write: Callable[[Any], Any]
-    take: Callable[[Any], Any]
+    type: str       # ROS message type
+    value: type     # class of its values
+    read: Callable[[Any], Any]      # message -> value; MessageError for another layout
+    write: Callable[[Any], Any]     # value -> message
+    take: Callable[[Any], Any]      # message -> value in flight; MessageError for an unusable one
 
 
 def form(name: str, value: type, read: Callable[[Any], Any], write: Callable[[Any], Any],

@@ -43,22 +43,13 @@ TOPICS = {MOCAP: ('the MoCap driver', '', 100.0, 0.03, 0.1),
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """
-    One row of the result.
+    """One row of the result."""
 
-    Attributes:
-        item: name of the checked item, stable for scripts.
-        level: 'ok', 'warn' (the robot can fly, but look at the item) or 'fail'.
-        found: description with numbers and units.
-        remedy: what to do; '' for level 'ok'.
-        values: numbers behind ``found``; each key ends with the unit.
-
-    """
-
-    item: str
-    level: str
-    found: str
-    remedy: str = ''
+    item: str           # name of the checked item, stable for scripts
+    level: str          # 'ok', 'warn' (the robot can fly, but look at the item) or 'fail'
+    found: str          # description with numbers and units
+    remedy: str = ''    # what to do; '' for level 'ok'
+    # Numbers behind ``found``; each key ends with the unit.
     values: Mapping[str, float | int | str | None] = field(default_factory=dict)
 
 
@@ -83,47 +74,27 @@ class Findings(list[Finding]):
 
 @dataclass
 class Stream:
-    """
-    Messages of one topic.
+    """Messages of one topic."""
 
-    Attributes:
-        arrivals: arrival times on a monotonic clock [s].
-        ages: clock of this computer minus stamp, at arrival [s]; the smallest is the latency plus
-            the offset between the clocks.
-        norms: norm of the measured vector of each message, equal only if a sensor is frozen.
-        refused: reason -> number of unusable messages.
-        publishers: names of the publishing nodes.
-        other_types: other message types under which the topic is published.
-
-    """
-
-    arrivals: list[float] = field(default_factory=list)
+    arrivals: list[float] = field(default_factory=list)     # times on a monotonic clock [s]
+    # Clock of this computer minus stamp, at arrival [s]; the smallest is the latency plus the
+    # offset between the clocks.
     ages: list[float] = field(default_factory=list)
-    norms: list[float] = field(default_factory=list)
-    refused: Counter = field(default_factory=Counter)
-    publishers: list[str] = field(default_factory=list)
-    other_types: list[str] = field(default_factory=list)
+    norms: list[float] = field(default_factory=list)    # of vectors, equal only of a frozen sensor
+    refused: Counter = field(default_factory=Counter)   # reason -> number of unusable messages
+    publishers: list[str] = field(default_factory=list)     # names of the publishing nodes
+    other_types: list[str] = field(default_factory=list)    # under which it is published, too
 
 
 @dataclass
 class ObservedGraph:
-    """
-    Everything observed during one check.
+    """Everything observed during one check."""
 
-    Attributes:
-        domain: ROS domain.
-        seconds: duration of the observation [s].
-        streams: topic -> its messages.
-        states: bridge ('joint_bridge', 'rotor_bridge') -> its latched state.
-        diagnostics: name of a status -> the newest one.
-
-    """
-
-    domain: int = 0
-    seconds: float = 0.0
-    streams: dict[str, Stream] = field(default_factory=dict)
-    states: dict[str, str] = field(default_factory=dict)
-    diagnostics: dict[str, Diagnostic] = field(default_factory=dict)
+    domain: int = 0         # ROS domain
+    seconds: float = 0.0    # duration of the observation [s]
+    streams: dict[str, Stream] = field(default_factory=dict)    # topic -> its messages
+    states: dict[str, str] = field(default_factory=dict)    # 'joint_bridge' -> its latched state
+    diagnostics: dict[str, Diagnostic] = field(default_factory=dict)    # name -> the newest one
 
     def of_bridge(self, bridge: str) -> dict[str, Diagnostic]:
         """Diagnostics of a bridge's node: name without the prefix 'NODE: ' -> status."""

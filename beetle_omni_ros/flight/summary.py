@@ -136,25 +136,14 @@ def task_title(task: str) -> str:
 
 @dataclass(frozen=True)
 class Metric:
-    """
-    A number that a flight has once, or once for each pose.
+    """A number that a flight has once, or once for each pose."""
 
-    Attributes:
-        title: its name with the unit.
-        digits: displayed digits.
-        of: path in the metrics of a flight, or function of them.
-        printed: path of the published mean.
-        more: whether more is better.
-        glance: whether it is in the table of all experiments.
-
-    """
-
-    title: str
-    digits: int
-    of: str | Callable[[dict], Any]
-    printed: str = ''
-    more: bool = False
-    glance: bool = False
+    title: str              # its name with the unit
+    digits: int             # displayed digits
+    of: str | Callable[[dict], Any]     # path in the metrics of a flight, or function of them
+    printed: str = ''       # path of the published mean
+    more: bool = False      # whether more is better
+    glance: bool = False    # whether it is in the table of all experiments
 
     def value(self, judged: dict) -> Any:
         """Return the number of a flight, or the list of those of its poses."""
