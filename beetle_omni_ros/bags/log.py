@@ -72,10 +72,10 @@ class Series(SimpleNamespace):
         return slice(int(np.searchsorted(self.t, begin - EDGE, side='left')),
                      int(np.searchsorted(self.t, end + EDGE, side='right')))
 
-    def covers(self, begin: float, end: float, gap: float = 0.1) -> bool:
-        """Whether the first and last sample in the window are within ``gap`` [s] of its edges."""
+    def covers(self, begin: float, end: float) -> bool:
+        """Whether the first and last sample in the window are within 0.1 s of its edges."""
         times = self.t[self.window(begin, end)]
-        return len(times) > 0 and times[0] <= begin + gap and times[-1] >= end - gap
+        return len(times) > 0 and times[0] <= begin + 0.1 and times[-1] >= end - 0.1
 
 
 @dataclass

@@ -28,16 +28,8 @@ def before_and_after(robot: Path | None, corrected: Path, plant: Path | None,
     """
     Fly controllers with a robot file and with the corrected one on the same plant.
 
-    Args:
-        robot: robot file before; None: the shipped one.
-        corrected: robot file after.
-        plant: true robot of the simulation; None: ``corrected``.
-        controllers: names.
-        task: task of every flight.
-        seeds: of task and simulation; one flight for each.
-        folder: keeps finished flights, so that a repeated call flies the rest.
-        jobs: parallel flights; None: one on each core.
-        console: for progress.
+    Arguments are as of `beetle_omni improve`; one flight for each of ``seeds``. ``folder`` keeps
+    finished flights, so that a repeated call flies the rest.
 
     Returns:
         controller -> 'before' and 'after' with reached, poses and the means of ``ERRORS``,
