@@ -199,14 +199,7 @@ def check_board(parameters: MotorBoardParameters, robot: RobotParameters, second
 
 
 def _listen(board, seconds):
-    """
-    Poll the board.
-
-    Returns:
-        the newest battery and rotors, and a list of (number of packets sent, the board's counts)
-        for each report of the board's reception.
-
-    """
+    """Newest battery and rotors, and (packets sent, the board's counts) of each report of these."""
     rotors = battery = None
     receptions = []
     started = time.monotonic()

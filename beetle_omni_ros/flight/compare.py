@@ -223,12 +223,9 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
 
 
 def _available(names, policy, refuse):
-    """
-    Build each controller once, which also fills the cache of compiled code for the workers.
-
-    Returns the entries that can fly with the text of their guidance, and the reason for each
-    other one. With ``refuse`` the first reason is raised instead.
-    """
+    """Build each controller once, which also fills the cache of compiled code for the workers."""
+    # Returns the entries that can fly with the text of their guidance, and the reason for each
+    # other one. With ``refuse`` the first reason is raised instead.
     robot, available, skipped = RobotParameters.load(), {}, {}
     learnt = registry.OWNER['policy']
     for entry in registry.find_all(names):

@@ -254,12 +254,9 @@ class Component:
         self._identity = identity
 
     def _check_source(self, source):
-        """
-        Refuse commands of a second publisher.
-
-        Until a supervisor publishes its identity, every command is accepted; after that, only
-        those with the newest identity.
-        """
+        """Refuse commands of a second publisher."""
+        # Until a supervisor publishes its identity, every command is accepted; after that, only
+        # those with the newest identity.
         identity = self._identity
         if identity and source != identity:
             name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'

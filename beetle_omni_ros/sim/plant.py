@@ -220,11 +220,8 @@ class Plant:
         limits[4:, 1] = clipped(gain * (rate_limit - rate), -effort, effort)
 
     def _apply_forces(self, ahead=0.0):
-        """
-        Apply the external wrench and the effects' forces, predicted ``ahead`` [s] from now.
-
-        Those in the middle of a tick, held during it, are accurate to second order.
-        """
+        """Apply the external wrench and the effects' forces, predicted ``ahead`` [s] from now."""
+        # Those in the middle of a tick, held during it, are accurate to second order.
         applied = self._applied
         applied[:] = self.wrench
         if not self._added.active:
@@ -246,11 +243,8 @@ class Plant:
             voltage_ratio=self.voltage_ratio)
 
     def _rub(self, others):
-        """
-        Set the friction of the joints for one substep: what stops them, within its limit.
-
-        So a joint below its stiction rests without the solver of contacts.
-        """
+        """Set the friction of the joints for one substep: what stops them, within its limit."""
+        # So a joint below its stiction rests without the solver of contacts.
         joints, model, rate = self._robot.joints, self.model, self._rate
         limits = model.actuator_forcerange[4:].T if model.actuator_forcelimited[4:].all() \
             else (-np.inf, np.inf)

@@ -266,11 +266,8 @@ class Supervisor:
     # One function for each state --------------------------------------------------------------
 
     def _stand(self, now, dt):
-        """
-        Motors off: zero thrust for a short time, then no command.
-
-        A rotor that ignores its thrust command is turned so that it presses on the floor.
-        """
+        """Motors off: zero thrust for a short time, then no command."""
+        # A rotor that ignores its thrust command is turned so that it presses on the floor.
         self.source = 'none'
         last = self.output.in_force
         if self._in_state > STOP_TIME + 1e-9 or last is None:

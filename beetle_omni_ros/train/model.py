@@ -83,12 +83,9 @@ def _servos(robot, x, target, h, body):
 
 
 def _behind_play(gap, tilt, rate):
-    """
-    Tilts of the rotors (4,) behind the play of the joints.
-
-    A turning motor leads by half the gap. The state has no side of contact at rest, so the rotor
-    is then in the middle.
-    """
+    """Tilts of the rotors (4,) behind the play of the joints."""
+    # A turning motor leads by half the gap. The state has no side of contact at rest, so the rotor
+    # is then in the middle.
     speed = rate / SLIDING_RATE
     return tilt - 0.5 * gap * speed / ca.sqrt(1 + speed * speed)
 
@@ -157,11 +154,8 @@ _OPERATIONS = {
 
 
 def _statements(function: ca.Function) -> list[str]:
-    """
-    Translate a scalar function with dense inputs to assignments.
-
-    Inputs and outputs are ``NAME_K``, with the function's own names and the index of the entry.
-    """
+    """Translate a scalar function with dense inputs to assignments."""
+    # Inputs and outputs are ``NAME_K``, with the function's own names and the index of the entry.
     lines = []
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)
