@@ -111,23 +111,15 @@ class Segment:
 
 @dataclass(frozen=True)
 class Task:
-    """
-    A named sequence of segments.
+    """A named sequence of segments."""
 
-    Attributes:
-        name: name or file given by the user.
-        kind: 'poses', 'trajectory', 'hover', 'force', 'torque', 'wind', 'pushes', 'payload' or
-            'steps'; it decides the metrics.
-        segments: segments in order.
-        poses: (P, 6) pose targets in order: x, y, z [m], roll, pitch, yaw [deg].
-        rounds: (start, end) of each round of a trajectory, since the task's start [s].
-
-    """
-
-    name: str
+    name: str       # or file given by the user
+    # 'poses', 'trajectory', 'hover', 'force', 'torque', 'wind', 'pushes', 'payload' or 'steps'; it
+    # decides the metrics.
     kind: str
-    segments: tuple[Segment, ...]
-    poses: np.ndarray
+    segments: tuple[Segment, ...]       # in order
+    poses: np.ndarray       # (P, 6) pose targets in order: x, y, z [m], roll, pitch, yaw [deg]
+    # (start, end) of each round of a trajectory, since the task's start [s].
     rounds: tuple[tuple[float, float], ...] = ()
 
     @property

@@ -199,7 +199,7 @@ def check_board(parameters: MotorBoardParameters, robot: RobotParameters, second
 
 
 def _listen(board, seconds):
-    """Newest battery and rotors, and (packets sent, the board's counts) of each report of these."""
+    """Newest battery and rotors; packets sent, and the board's counts, at each report of these."""
     rotors = battery = None
     receptions = []
     started = time.monotonic()
