@@ -17,7 +17,7 @@ from beetle_omni_ros.model.allocation import clipped
 MEMORY = 10.0       # [s] time constant of the forgetting
 NOISE_MEMORY = 2.0  # [s] of the variance of the errors
 PRIOR = 0.01        # [s] standard deviation of the delay before any motion
-CORRELATED = 0.1    # [s] within which errors are not independent
+CORRELATED = 0.5    # [s] within which errors are not independent: half a period of the loop
 RATE = 0.02         # [s/s] largest change of the estimate: slow against the loop
 OUTLIER = 3.0       # [1] standard deviations to which an error is clipped, as at a contact
 
