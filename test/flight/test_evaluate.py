@@ -127,16 +127,6 @@ def test_an_exception_in_flight_falls_back_and_is_in_the_results(tmp_path):
         '(bad.py:10)')
 
 
-def test_a_controller_that_fails_all_the_time_fails_the_command(poses, tmp_path, capsys):
-    bad = own(tmp_path, """if target.position[2] == 1.1:       # of the task
-    raise ValueError("bad")""", 'Bad')
-    result = tmp_path / 'result.json'
-    assert run(result, bad, poses) == 1
-    assert '0 of 1, 1 in fallback' in capsys.readouterr().out
-    results = json.loads(result.read_text())['bad']
-    assert results['success_rate'] == 0 and not results['crashed'] and results['controller_error']
-
-
 @pytest.fixture
 def interruptible():
     """Ctrl-C as in a program of its own, whatever the test's process does with it."""
