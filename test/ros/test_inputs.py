@@ -204,7 +204,9 @@ def test_each_target_is_recorded_once_with_any_quality_of_service(make_bench, tm
         heights.insert(0, 0.9)
         publisher.publish(pose(0.9))    # before the subscription
     recorder = bench.add(RecorderNode())
-    bench.wait(lambda: False, 1.2)      # the required subscriptions exist
+    assert bench.wait(lambda: publisher.get_subscription_count()
+                      and recorder.count_publishers('target_pose')
+                      and recorder._bag.counts['/target_pose'] == len(heights) - 3)
     for height in heights[-3:]:
         before = recorder._bag.counts['/target_pose']
         publisher.publish(pose(height))
