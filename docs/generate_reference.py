@@ -315,7 +315,7 @@ def python() -> str:
     import beetle_omni_ros as module
     from beetle_omni_ros.bags import log
     from beetle_omni_ros.control import base
-    from beetle_omni_ros.show.notebook import NotebookLog
+    from beetle_omni_ros.show.report import NotebookLog
     text = [f'# Python\n\n{MADE}\n{TIMES}']
     for name in module.__all__:
         found = getattr(module, name)

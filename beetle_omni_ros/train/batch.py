@@ -3,6 +3,7 @@
 import torch
 
 from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model import rotations
 from beetle_omni_ros.train.model import ARM, COULOMB, DAMPING, GAIN, LAG, MASS, STIFFNESS
 
 PERIOD = 0.01   # [s] between two entries of a history
@@ -10,21 +11,12 @@ PERIOD = 0.01   # [s] between two entries of a history
 
 def matrix(quaternion: torch.Tensor) -> torch.Tensor:
     """Rotation matrices (N, 3, 3) of unit quaternions (N, 4), (x, y, z, w)."""
-    x, y, z, w = quaternion.unbind(-1)
-    rows = (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    return torch.stack(rotations.entries(*quaternion.unbind(-1)), -1).unflatten(-1, (3, 3))
 
 
 def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Quaternion product (N, 4), first ``b`` then ``a``."""
-    ax, ay, az, aw = a.unbind(-1)
-    bx, by, bz, bw = b.unbind(-1)
-    return torch.stack((aw * bx + ax * bw + ay * bz - az * by,
-                        aw * by - ax * bz + ay * bw + az * bx,
-                        aw * bz + ax * by - ay * bx + az * bw,
-                        aw * bw - ax * bx - ay * by - az * bz), -1)
+    return torch.stack(rotations.product(*a.unbind(-1), *b.unbind(-1)), -1)
 
 
 def from_rotation_vector(vector: torch.Tensor) -> torch.Tensor:
@@ -144,7 +136,7 @@ def delayed(history: torch.Tensor, delay: torch.Tensor) -> torch.Tensor:
 def acting(sent: torch.Tensor, delay: torch.Tensor) -> tuple[tuple[torch.Tensor, ...],
                                                              torch.Tensor]:
     """
-    Three commands (N, 8) of which :class:`train.physics.Physics` needs the delayed ones.
+    Three commands (N, 8) of which :class:`train.model.Physics` needs the delayed ones.
 
     Args:
         sent: (N, H, 8) commands, newest first.

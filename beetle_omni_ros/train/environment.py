@@ -23,9 +23,9 @@ from beetle_omni_ros.train.model import (
     MASS,
     module_reaction,
     nominal_body,
+    Physics,
 )
 from beetle_omni_ros.train.parameters import TrainParameters
-from beetle_omni_ros.train.physics import Physics
 from beetle_omni_ros.train.starts import (
     LONGEST_DELAY,
     MISSED_ATTITUDE,
@@ -234,13 +234,10 @@ class TiltableQuadrotorEnv:
         return torch.cat(parts, -1)
 
     def _disturbance_estimate(self, s, new):
-        """
-        Disturbance estimate (N, 6): the wrench outside the nominal model, through a lag.
-
-        The estimator compares the measured motion with the effect of the present commands on the
-        nominal robot. A delayed rate gives an error: the difference of the delayed, extrapolated
-        change of rate and the present change.
-        """
+        """Disturbance estimate (N, 6): the wrench outside the nominal model, through a lag."""
+        # The estimator compares the measured motion with the effect of the present commands on the
+        # nominal robot. A delayed rate gives an error: the difference of the delayed, extrapolated
+        # change of rate and the present change.
         x, old, body = new['x'], s['x'], new['body']
         changes = (x[:, model.VELOCITY] - old[:, model.VELOCITY],
                    x[:, model.RATE] - old[:, model.RATE])

@@ -273,12 +273,9 @@ CROSS_PRODUCTS, DOT_PRODUCTS = 12, 27      # of two cross products and nine scal
 
 
 def _folded(size):
-    """
-    Left and right matrices of both stages of products, and the matrix of the features.
-
-    Features of the rows of a unit matrix are a matrix, if all that is not linear is replaced by a
-    linear function of the results of the stages.
-    """
+    """Left and right matrices of both stages of products, and the matrix of the features."""
+    # Features of the rows of a unit matrix are a matrix, if all that is not linear is replaced by
+    # a linear function of the results of the stages.
     known = torch.eye(size + CROSS_PRODUCTS + DOT_PRODUCTS)
     products = iter(known[:, size:].split(3, -1))
     crossed, dotted = [], []

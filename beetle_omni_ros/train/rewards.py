@@ -70,10 +70,7 @@ def terms(*, position_error, attitude_error, speed, rate, tilt, tilt_rate, previ
 
 
 def _sunk(depth):
-    """
-    Depth as a number in [0, 1), small for the few centimetres that any quick move sinks.
-
-    It saturates, because otherwise an early end of the episode would pay.
-    """
+    """Depth as a number in [0, 1), small for the few centimetres that any quick move sinks."""
+    # It saturates, because otherwise an early end of the episode would pay.
     square = (depth / SINKING_LIMIT) ** 2
     return square / (1 + square)

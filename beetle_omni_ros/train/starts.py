@@ -16,26 +16,16 @@ from beetle_omni_ros.model.allocation import Allocator
 from beetle_omni_ros.model.degraded import sphere
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.model import (
-    ACTUATORS,
-    actuators,
-    ARM,
-    COULOMB,
-    DAMPING,
-    GAIN,
-    LAG,
-    nominal_body,
-    STICTION,
-)
+from beetle_omni_ros.train import batch, model
 from beetle_omni_ros.train.parameters import STRATA, TrainParameters
 
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
 MOVING_SPEED, MOVING_RATE = 1.5, 3.0   # [m/s], [rad/s] largest of a moving start, each axis
 # Places of damping, friction and lag among the drawn quantities of the actuators.
 _DAMPING, _FRICTION, _LAG = (
-    slice(first.start - ACTUATORS.start, last.stop - ACTUATORS.start)
-    for first, last in ((DAMPING, DAMPING), (COULOMB, STICTION), (LAG, LAG)))
+    slice(first.start - model.ACTUATORS.start, last.stop - model.ACTUATORS.start)
+    for first, last in ((model.DAMPING, model.DAMPING), (model.COULOMB, model.STICTION),
+                        (model.LAG, model.LAG)))
 DRAWN = 2048    # robots from the measured intervals, of which the robots of the training are made
 OLDER, PAST_TILTS = 5, 4    # stored commands before the previous one; stored tilts
 LONGEST_DELAY = (OLDER + 1) * batch.PERIOD      # [s] of the stored commands
@@ -54,7 +44,7 @@ FORGET_FLOWN, FORGET_MISSED = 0.5, 0.1            # probability of deletion afte
 def drawn_actuators(robot_file: str, seed: int) -> np.ndarray:
     """(DRAWN, 23) actuators and delays of robots from the intervals of a file; takes seconds."""
     measured, rng = RobotParameters.load(robot_file), np.random.default_rng(seed)
-    return np.array([[*actuators(one), *one.command_delays] for one in (
+    return np.array([[*model.actuators(one), *one.command_delays] for one in (
         measured.drawn(rng) for _ in range(DRAWN))])
 
 
@@ -100,13 +90,13 @@ class Starts:
                     for k, name in enumerate(STRATA)}
         self.stratum = stratum
         self._inverse = tensor(Allocator(robot).inverse[:, :3])
-        self._weight = tensor([0.0, 0.0, nominal_body(robot)[0] * robot.gravity])
-        self._body = tensor(nominal_body(robot))
+        self._weight = tensor([0.0, 0.0, model.nominal_body(robot)[0] * robot.gravity])
+        self._body = tensor(model.nominal_body(robot))
         self._region = tensor(parameters.episode.region)
         self._rotors = torch.arange(4, device=device)
         _, thrusts = Allocator(robot).upright(sphere(DIRECTIONS))
         self._least_gain = float(thrusts.max() / (FULL_THRUST * robot.rotors.thrust_max)) \
-            / nominal_body(robot)[0]
+            / model.nominal_body(robot)[0]
         self.severity = torch.ones((), device=device)
         self._limit = float(robot.joints.position_limit)
         # plain floats, because a compiler takes numpy scalars for tensors of the host
@@ -115,7 +105,7 @@ class Starts:
         self._latencies = latencies(parameters, robot)
         self._spread = [float(share) for share in r.actuator_spread]
         self._friction = [float(factor) for factor in r.friction_scale]
-        self._nominal = tensor([*actuators(robot), *robot.command_delays])
+        self._nominal = tensor([*model.actuators(robot), *robot.command_delays])
         self._drawn = tensor(drawn_actuators(r.actuators, parameters.seed))
         self._least = LEAST * torch.minimum(self._drawn.min(0).values, self._nominal)
         self._thrust_limit = [float(t) for t in r.thrust_limit]
@@ -199,9 +189,9 @@ class Starts:
         body = self._body.expand(self._count, -1)
         load = self.severity * d.chance(r.payload_share) * d.uniform(1, 0.0, r.payload)
         mass = body[:, 0:1] * (1 + d.around(r.mass_scale, 1))
-        arm = body[:, ARM] * (1 + d.around(r.arm_scale, 1))
+        arm = body[:, model.ARM] * (1 + d.around(r.arm_scale, 1))
         weak = d.chance(r.weak_share) & (torch.floor(4 * d.uniform(1)) == self._rotors)
-        gain = body[:, GAIN] * (1 + d.around(r.thrust_scale, 1)) \
+        gain = body[:, model.GAIN] * (1 + d.around(r.thrust_scale, 1)) \
             * (1 - weak * d.uniform(1, 0.0, r.weak_loss))
         # Other robots cannot hover at every attitude.
         gain = torch.maximum(gain, self._least_gain * mass)
@@ -222,7 +212,7 @@ class Starts:
             d.around(r.position_bias, 3), d.around(r.attitude_bias, 3),
             d.around(r.velocity_bias, 3), d.around(r.rate_bias, 3), d.around(r.tilt_bias, 4),
             d.around(r.estimated_force_bias, 3), d.around(r.estimated_torque_bias, 3)), -1)
-        actuators, later = self._actuators(d)
+        quantities, later = self._actuators(d)
         delays = torch.cat([d.uniform(1, *span) for span in self._latencies], -1)
         late = [d.chance(r.late_share) * d.uniform(1, 0.0, most)
                 for most in (r.late_commands, r.late_tilts)]
@@ -234,7 +224,7 @@ class Starts:
         # Late robots that oscillate would fill the replays.
         disturbed = (forced | strong | pushed | (load > 0) | (late[0] + late[1] > 0)).float()
         return {'thrust_limit': d.uniform(1, *self._thrust_limit),
-                'body': torch.cat((total, inertia, centre, actuators, arm, gain), -1),
+                'body': torch.cat((total, inertia, centre, quantities, arm, gain), -1),
                 'wrench': wrench,
                 'other_wrench': usual,
                 'noise': noise, 'bias': bias, 'delays': delays, 'extrapolated': extrapolated,

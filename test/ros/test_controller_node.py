@@ -2,17 +2,15 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.ros import graph
-from beetle_omni_ros.ros.control_nodes import SupervisorNode
+from beetle_omni_ros.ros.nodes import SupervisorNode
 from beetle_omni_ros.ros.runner import maker
 
-LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
 OWN, OBSERVER = (f'{EXAMPLES}/own_controller.py:PoseController',
                  f'{EXAMPLES}/own_component.py:WrenchObserver')

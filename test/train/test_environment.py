@@ -13,9 +13,8 @@ from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Battery
 from beetle_omni_ros.train import rewards
 from beetle_omni_ros.train.environment import FORCE_BANDWIDTH, TORQUE_BANDWIDTH
-from beetle_omni_ros.train.model import nominal_body
+from beetle_omni_ros.train.model import nominal_body, Physics
 from beetle_omni_ros.train.parameters import TrainParameters
-from beetle_omni_ros.train.physics import Physics
 
 PERIOD = 0.01
 
