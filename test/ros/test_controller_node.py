@@ -14,6 +14,8 @@ from beetle_omni_ros.ros.runner import maker
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
 OWN, OBSERVER = (f'{EXAMPLES}/own_controller.py:PoseController',
                  f'{EXAMPLES}/own_component.py:WrenchObserver')
+
+
 def test_the_supervisor_selects_among_the_listed_controllers(make):
     node = make(SupervisorNode, f"controllers:=['nmpc','{OWN}']", 'controller:=pose_controller')
 
