@@ -3,6 +3,7 @@
 from dataclasses import replace
 import fcntl
 from pathlib import Path
+import shutil
 
 import beetle_omni_ros
 
@@ -27,6 +28,7 @@ def flight(name):
             poses, wind, options = FLIGHTS[name]
             robot, new = beetle_omni_ros.robot(), folder / 'new' / name
             new.parent.mkdir(exist_ok=True)
+            shutil.rmtree(new, ignore_errors=True)      # of a test that exceeded its time
             beetle_omni_ros.simulate('hover', poses, bag=new, **options, plant=replace(
                 robot, effects={'wind': {'force': wind}}) if wind is not None else robot)
             new.rename(bag)
