@@ -21,15 +21,11 @@ from beetle_omni_ros.train.parameters import STRATA, TrainParameters
 
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
 MOVING_SPEED, MOVING_RATE = 1.5, 3.0   # [m/s], [rad/s] largest of a moving start, each axis
-# Places of damping, friction and lag among the drawn quantities of the actuators.
-_DAMPING, _FRICTION, _LAG = (
-    slice(first.start - model.ACTUATORS.start, last.stop - model.ACTUATORS.start)
-    for first, last in ((model.DAMPING, model.DAMPING), (model.COULOMB, model.STICTION),
-                        (model.LAG, model.LAG)))
+# Places of damping and lag among the drawn quantities of the actuators.
+_DAMPING, _LAG = (slice(part.start - model.ACTUATORS.start, part.stop - model.ACTUATORS.start)
+                  for part in (model.DAMPING, model.LAG))
 DRAWN = 2048    # robots from the measured intervals, of which the robots of the training are made
-OLDER, PAST_TILTS = 5, 4    # stored commands before the previous one; stored tilts
-LONGEST_DELAY = (OLDER + 1) * batch.PERIOD      # [s] of the stored commands
-OLDEST_TILT = PAST_TILTS * batch.PERIOD         # [s]
+LONGEST_DELAY = 2 * batch.PERIOD    # [s] of the stored commands and tilts
 DIRECTIONS = 200     # of up in the body, for the thrust that a robot needs to hover
 FULL_THRUST = 0.95   # of the largest thrust, which the most demanding attitude may need
 LEAST = 0.2     # smallest drawn quantity of an actuator, as a fraction of the smallest measured
@@ -57,10 +53,9 @@ def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[
                              ('velocity', r.velocity_latency, 0.0),
                              ('joint feedback', r.tilt_latency, robot.sensors.encoder_delay)):
         made.append([max(float(t) + more, 0.0) for t in span])
-        stored = OLDEST_TILT if name == 'joint feedback' else LONGEST_DELAY
-        if made[-1][1] > stored + 1e-9:
+        if more and made[-1][1] > LONGEST_DELAY + 1e-9:
             raise ParameterError(f'effects: {name} are up to {1e3 * made[-1][1]:g} ms late, '
-                                 f'the training environment stores {1e3 * stored:g} ms')
+                                 f'the training environment stores {1e3 * LONGEST_DELAY:g} ms')
     return made
 
 
@@ -104,7 +99,6 @@ class Starts:
         r = parameters.random
         self._latencies = latencies(parameters, robot)
         self._spread = [float(share) for share in r.actuator_spread]
-        self._friction = [float(factor) for factor in r.friction_scale]
         self._nominal = tensor([*model.actuators(robot), *robot.command_delays])
         self._drawn = tensor(drawn_actuators(r.actuators, parameters.seed))
         self._least = LEAST * torch.minimum(self._drawn.min(0).values, self._nominal)
@@ -128,9 +122,9 @@ class Starts:
         body_velocity = batch.transpose_product(batch.matrix(attitude), velocity)
         motion = torch.cat((body_velocity, rate), -1)
         command = torch.cat((tilt, thrust), -1)
-        state = {'x': x, 'previous': command, 'older': command[:, None].expand(-1, OLDER, -1),
+        state = {'x': x, 'previous': command, 'older': command,
                  'past_motion': motion[:, None].expand(-1, 4, -1),
-                 'past_tilt': tilt[:, None].expand(-1, PAST_TILTS, -1),
+                 'past_tilt': tilt[:, None].expand(-1, 2, -1),
                  'age': torch.zeros_like(tilt[:, 0]), 'trim': torch.zeros_like(x[:, :6])}
         state.update(self.target(d, x[:, :3], attitude))
         state['target_attitude'] = torch.where(self._is['hold'], attitude,
@@ -181,7 +175,6 @@ class Starts:
         slower = 1 + d.around(self._p.random.lag_scale, 2)
         made[:, _DAMPING] *= slower[:, :1]
         made[:, _LAG] *= slower[:, 1:]
-        made[:, _FRICTION] *= d.uniform(1, *self._friction).clamp(min=0)
         return made[:, :-2], made[:, -2:] - self._nominal[-2:]
 
     def _randomisation(self, d):
@@ -214,15 +207,11 @@ class Starts:
             d.around(r.estimated_force_bias, 3), d.around(r.estimated_torque_bias, 3)), -1)
         quantities, later = self._actuators(d)
         delays = torch.cat([d.uniform(1, *span) for span in self._latencies], -1)
-        late = [d.chance(r.late_share) * d.uniform(1, 0.0, most)
-                for most in (r.late_commands, r.late_tilts)]
-        delays = torch.cat(((delays[:, :2] + later + late[0]).clamp(0.0, LONGEST_DELAY),
-                            delays[:, 2:3], (delays[:, 3:] + late[1]).clamp(max=OLDEST_TILT),
-                            d.uniform(1, 0.0, r.jitter)), -1)
+        delays = torch.cat(((delays[:, :2] + later).clamp(0.0, LONGEST_DELAY),
+                            delays[:, 2:]), -1)
         pushed = d.chance(r.push_share)
         extrapolated = d.chance(r.carried_share).float()
-        # Late robots that oscillate would fill the replays.
-        disturbed = (forced | strong | pushed | (load > 0) | (late[0] + late[1] > 0)).float()
+        disturbed = (forced | strong | pushed | (load > 0)).float()
         return {'thrust_limit': d.uniform(1, *self._thrust_limit),
                 'body': torch.cat((total, inertia, centre, quantities, arm, gain), -1),
                 'wrench': wrench,
