@@ -101,10 +101,12 @@ def _mark(figure, runs, row):
     """Shade the windows of the first run's poses, and draw the faults of all runs."""
     first = runs[0].log
     stamps = [t.stamp - first.begin for t in first.targets if isinstance(t, PoseTarget)]
-    for stamp in stamps if len(stamps) <= FEW_POSES else ():
-        for (begin, end), colour in ((L_WINDOW, L_COLOUR), (U_WINDOW, U_COLOUR)):
-            figure.add_vrect(stamp + begin, stamp + end, fillcolor=colour, line_width=0,
-                             layer='below', row=row, col=1)
+    x, y = figure.data[-1].xaxis, figure.data[-1].yaxis
+    figure.layout.shapes += tuple(      # add_vrect takes tenths of a second for each
+        {'type': 'rect', 'xref': x, 'x0': stamp + begin, 'x1': stamp + end, 'layer': 'below',
+         'yref': f'{y} domain', 'y0': 0, 'y1': 1, 'fillcolor': colour, 'line': {'width': 0}}
+        for stamp in (stamps if len(stamps) <= FEW_POSES else ())
+        for (begin, end), colour in ((L_WINDOW, L_COLOUR), (U_WINDOW, U_COLOUR)))
     faults = [(at - run.log.begin, name) for run in runs
               for name, at in run.log.named_faults().items()]
     for at, name in faults[:MOST_MARKS]:

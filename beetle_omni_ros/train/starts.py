@@ -7,6 +7,8 @@ prioritised sampling of initial states, similar to that of steps in T. Schaul et
 experience replay (2016).
 """
 
+from functools import cache
+
 import numpy as np
 import torch
 
@@ -32,6 +34,14 @@ MISSED_POSITION, MISSED_ATTITUDE = 0.10, 0.10     # [m], [rad] at the end of a t
 MISSED_DEPTH = 0.15                               # [m] below both start and target, in between
 FULL = 0.01          # fraction of the robots with a stored state at which all replays happen
 FORGET_FLOWN, FORGET_MISSED = 0.5, 0.1            # probability of deletion after a replay
+
+
+@cache
+def drawn_actuators(robot_file: str, seed: int) -> np.ndarray:
+    """(DRAWN, 23) actuators and delays of robots from the intervals of a file; takes seconds."""
+    measured, rng = RobotParameters.load(robot_file), np.random.default_rng(seed)
+    return np.array([[*model.actuators(one), *one.command_delays] for one in (
+        measured.drawn(rng) for _ in range(DRAWN))])
 
 
 def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[float]]:
@@ -89,11 +99,8 @@ class Starts:
         r = parameters.random
         self._latencies = latencies(parameters, robot)
         self._spread = [float(share) for share in r.actuator_spread]
-        measured = RobotParameters.load(r.actuators)
         self._nominal = tensor([*model.actuators(robot), *robot.command_delays])
-        rng = np.random.default_rng(parameters.seed)
-        self._drawn = tensor([[*model.actuators(one), *one.command_delays] for one in (
-            measured.drawn(rng) for _ in range(DRAWN))])
+        self._drawn = tensor(drawn_actuators(r.actuators, parameters.seed))
         self._least = LEAST * torch.minimum(self._drawn.min(0).values, self._nominal)
         self._thrust_limit = [float(t) for t in r.thrust_limit]
 

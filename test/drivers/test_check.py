@@ -2,7 +2,6 @@
 
 import json
 import sys
-import time
 
 import pytest
 
@@ -222,8 +221,8 @@ def test_a_silent_or_foreign_board_ends_the_checks(emulated, monkeypatch):
         found = board_with(emulated, {'motor board': 'fail'}, seconds=0.5)
     assert 'another device' in found['motor board'].remedy
     emulated.faults.drop_out = 1.0
-    time.sleep(0.1)     # a frame may be under way
-    found = board(emulated.port, seconds=0.5)
+    found = repeated(lambda: board(emulated.port, seconds=0.5),     # a frame may be under way
+                     lambda found: '0 bytes' in found['motor board'].found)
     assert list(found) == ['board port', 'motor board']
     assert '0 bytes' in found['motor board'].found
     emulated.unplug()

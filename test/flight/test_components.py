@@ -224,22 +224,6 @@ def supervisor():
     return Desk(SupervisorComponent(SupervisorParameters.load(), ROBOT, ('nmpc', 'rl')), 10.0)
 
 
-def test_the_supervisor_refuses_to_arm_with_the_reason_of_bridges_or_estimator(supervisor):
-    def refusal():
-        answer = supervisor.component.services['arm']()
-        assert not answer and supervisor.values('supervisor/state') == ['disarmed']
-        return answer.text
-
-    assert 'ekf_node' in refusal()
-    supervisor.component.feed('rotor_bridge/state', 'waiting: battery low')
-    supervisor.component.feed('joint_bridge/state', 'lost: gimbal3 silent')
-    assert refusal() == 'arm refused: joint_bridge_node lost: gimbal3 silent; rotor_bridge_node ' \
-                        'waiting: battery low'
-    for name in ('joint', 'rotor'):
-        supervisor.component.feed(f'{name}_bridge/state', 'ready')
-    assert 'no fresh state estimate' in refusal()
-
-
 def test_the_supervisor_signs_its_commands_and_sends_each_once(supervisor):
     identity, = supervisor.values(IDENTITY)
     assert re.fullmatch('supervisor_node:[0-9a-f]{8}', identity)

@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 import torch
 
-from beetle_omni_ros.control.disturbance import DisturbanceParameters
 from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Battery
@@ -190,23 +189,6 @@ def test_pushes_change_velocities_by_their_severity(severity):
     pushed = ((env.state['x'] - expected)[:, 3:6].abs().max(-1).values > 1e-5)[going]
     assert float(pushed.float().mean()) == pytest.approx(0.1 * severity, abs=0.05)
     assert bool(pushed.any()) == bool(severity)
-
-
-def test_the_estimate_approaches_the_disturbance():
-    env = quiet({**only('hold'), 'memory': True, 'random.force_share': 1.0, 'random.torque': 0.0,
-                 'random.force': 1.0, 'episode.target_time': [100, 100]}, robots=32)
-    force = env.state['wrench'][:, :3]
-    torch.testing.assert_close(env.state['estimate'][:, :3], force)     # it begins settled
-    env.state['estimate'].zero_()
-    env.state['age'].zero_()
-    begin = env.state['x'][:, :13].clone()
-    for _ in range(60):
-        env.state['x'][:, :13] = begin
-        env.advance((env.state['previous'] - env.offset) / env.scale)
-    assert not env.done.any()
-    assert force.abs().max() > 0.5
-    lag = 1 - (1 - DisturbanceParameters().force_bandwidth * PERIOD) ** 60
-    torch.testing.assert_close(env.state['estimate'][:, :3], lag * force, atol=1e-3, rtol=1e-3)
 
 
 def test_the_estimate_is_the_motion_that_the_nominal_robot_does_not_explain():

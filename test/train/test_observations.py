@@ -1,6 +1,6 @@
 """Observations of actor and critic for known states, with and without delay and noise."""
 
-from learning import environment, only, quiet, ROBOT, uniform
+from learning import only, quiet, uniform
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -57,25 +57,6 @@ def test_without_noise_and_delay_batch_and_controller_observations_agree(memory)
     assert seen.shape == (env.num_envs, 39 if memory else 33)
     expected = np.stack([on_board(env, k) for k in range(env.num_envs)])
     np.testing.assert_allclose(seen, expected, atol=2e-5)
-
-
-def test_the_critic_observes_the_truth_with_rotor_torques_and_thrusts():
-    env = environment({'memory': True, 'random.noise_power': 0})
-    s = scattered(env)
-    _, seen = env._observe(s, draw(env))
-    x, seen = s['x'].double().numpy(), seen.double().numpy()
-    body = Rotation.from_quat(x[:, 6:10])
-    goal = Rotation.from_quat(s['target_attitude'].numpy()).as_matrix()
-    back = body.inv()
-    torque = -np.array(ROBOT.rotors.spin) * ROBOT.rotors.torque_to_thrust_ratio * x[:, 21:25]
-    action = (s['previous'] - env.offset) / env.scale
-    columns = [back.apply(x[:, 3:6]), x[:, 10:13],
-               back.apply(s['target_position'].numpy() - x[:, :3]),
-               body.as_matrix()[:, :, 0], body.as_matrix()[:, :, 2], goal[:, :, 0], goal[:, :, 2],
-               x[:, 13:17], torque, x[:, 21:25], action, s['trim'],
-               back.apply(s['estimate'][:, :3].numpy()), s['estimate'][:, 3:],
-               s['body'][:, :1], s['body'][:, 28:]]
-    np.testing.assert_allclose(seen, np.hstack(columns), atol=2e-5)
 
 
 @pytest.mark.parametrize(('delay', 'weights'), [(0.0, [1, 0, 0]), (0.015, [0, 0.5, 0.5])])
