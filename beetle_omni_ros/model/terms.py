@@ -84,6 +84,7 @@ class EffectParameter:
     number: str = ''        # dotted key of the robot file's number that it replaces
     sensor: str = ''        # field of SensorErrors that it sets
     form: bool = False      # it only chooses a form of the effect and is not fitted
+    text: bool = False      # it is a list of expressions, see :mod:`model.formula`
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,8 @@ class Effect:
     apply: Callable | None = None
     # Equation of a joint effect, which changes ServoTerms: servo(terms, joint, **values).
     servo: Callable | None = None
-    each: str = ''      # 'rotor' or 'joint' if the parameters are (4,), one for each
+    # 'rotor' or 'joint' if the parameters are (4,), one for each; 'term': one for each expression
+    each: str = ''
     # Delayed quantities: 'tilt' and 'thrust' commands, readings of 'imu', 'mocap', 'encoders'.
     delays: tuple[str, ...] = ()
     allocated: bool = False     # the allocation includes it

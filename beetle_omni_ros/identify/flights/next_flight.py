@@ -276,7 +276,7 @@ class Planner:
     path: Path
 
     def __call__(self, engine: Engine, solution: Solution, result: dict,
-                 starts: Starts | None = None) -> dict[str, Any]:
+                 starts: Starts | None = None, judges: Sequence = ()) -> dict[str, Any]:
         """
         Plan a flight, check it, and write it as a task.
 
