@@ -123,7 +123,8 @@ VECTORS = {
                      'thrust direction'),
     'arm': Factor(ONE, 1.0, lambda q, i: q.terms.tilt_axes[i], 'a', 'arm'),
     'side': Factor(ONE, 1.0, lambda q, i: ca.cross(
-        q.terms.tilt_axes[i], q.terms.thrust_directions[i]), 'a x n', 'arm times thrust direction')}
+        q.terms.tilt_axes[i], q.terms.thrust_directions[i]), 'a x n',
+                   'arm times thrust direction')}
 for _k, _axis in enumerate('xyz'):
     VECTORS |= {
         _axis: Factor(ONE, 1.0, lambda q, i, k=_k: AXES[k], _axis, f'{_axis} of the body'),

@@ -222,11 +222,11 @@ def find_robot(name: str | Path, seen: tuple[Path, ...] = ()) -> Path:
 def _merged(path: Path, seen: tuple[Path, ...] = ()) -> dict:
     """Content of a robot file, merged with the file that it extends."""
     content = schema.load_yaml(path)
-    effects = content.get('effects')
-    for name, value in effects.items() if isinstance(effects, dict) else ():
-        if isinstance(value, str):      # a file of one effect
-            effects[name] = {key: own for key, own in schema.load_yaml(
-                path.parent / value).items() if key not in EFFECT_NOTES}
+    if isinstance(effects := content.get('effects'), dict):
+        content['effects'] = {name: {    # text is the path of a file of one effect
+            key: own for key, own in schema.load_yaml(path.parent / value).items()
+            if key not in EFFECT_NOTES} if isinstance(value, str) else value
+            for name, value in effects.items()}
     if 'extends' not in content:
         return content
     name, seen = content.pop('extends'), (*seen, path.resolve())

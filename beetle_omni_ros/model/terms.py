@@ -76,7 +76,8 @@ class EffectParameter:
     """One number, or vector, of an effect; SI units."""
 
     unit: str
-    neutral: float | tuple[float, ...]      # without effect; NaN: the robot file's own number
+    # without effect; NaN: the robot file's own number; of text: an example
+    neutral: float | tuple[float, ...] | tuple[str, ...]
     low: float                              # smallest and largest legal value
     high: float
     default: float | tuple[float, ...] | None = None    # if a file omits it; None: it is required

@@ -125,7 +125,8 @@ def friction(robot: RobotParameters) -> tuple[np.ndarray, np.ndarray]:
 
 def all_keys(robot: RobotParameters) -> dict[str, Key]:
     """Keys of the whole catalogue with base values of ``robot``, by name."""
-    keys, effects = {}, dict(robot.effects)
+    keys: dict[str, Key] = {}
+    effects = dict(robot.effects)
     if 'joint_friction' in effects:
         effects['joint_friction'] = dict(zip(CATALOGUE['joint_friction'].parameters,
                                              friction(robot), strict=True))
@@ -157,7 +158,7 @@ def _terms(robot, name, size):
     """Keys of the terms of a formula; together, narrow ones have the smallest relevant size."""
     own = robot.effects.get(name, {'expressions': (), 'coefficients': ()})
     weight, arm = robot.mass * robot.gravity, arm_of(robot)
-    keys = {}
+    keys: dict[str, Key] = {}
     for k, (term, value) in enumerate(zip(*own.values(), strict=True)):
         typical, text = size_of_term(term, weight, arm), f'{name}.coefficients[{k}]'
         keys[text] = Key(text, name, 'coefficients', k, value, False, size.typical * typical,
