@@ -15,7 +15,7 @@ from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.body import BodyModel
 from beetle_omni_ros.identify.flights.command import gap_results
 from beetle_omni_ros.identify.flights.keys import all_keys, extra_keys
-from beetle_omni_ros.identify.flights.learn import learned, Search
+from beetle_omni_ros.identify.flights.learn import learned
 from beetle_omni_ros.identify.flights.verdict import judged
 from beetle_omni_ros.identify.recording.bag import read_recording
 from beetle_omni_ros.identify.recording.flight import prepare
@@ -70,13 +70,12 @@ def test_flights_that_the_robot_file_explains_have_no_formula():
     robot = replace(ROBOT, effects={'wind': {'force': WIND}})
     recordings = [prepare(replace(read_recording(Path(flight(name))), name=name), robot, P, False)
                   for name in ('windy_0', 'windy_1')]
-    terms = library()
-    search = Search({'findings': [], 'candidates': []}, terms)
-    judged(recordings, [], replace(robot, effects=robot.effects | {'formula': {
-        'expressions': terms, 'coefficients': (0.0,) * len(terms)}}), P, then=search)
-    assert search.found['formula'] == {
-        'reason': f'none of {len(terms)} terms has enough evidence beside the catalogue'}
-    assert search.found['findings'] == [f"No formula: {search.found['formula']['reason']}"]
+    result = learned(lambda robot, then: judged(recordings, [], robot, P, then=then), robot, {
+        'verdict': 'unknown', 'findings': [], 'candidates': [],
+        'groups': {'torque': {'used': True}, 'joint': {'used': True}}})
+    assert result['formula'] == {
+        'reason': f'none of {len(library())} terms has enough evidence beside the catalogue'}
+    assert result['findings'] == [f"No formula: {result['formula']['reason']}"]
 
 
 def test_nothing_is_learned_without_a_gap_or_beside_a_formula():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.model import dynamics
-from beetle_omni_ros.model.formula import library, parsed, size_of, symbols_of, unit_of, words_of
+from beetle_omni_ros.model.formula import described, library, parsed, size_of
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.forces import AddedForces
@@ -76,10 +76,10 @@ def test_each_term_of_the_library_has_words_a_unit_a_size_and_an_effect():
     made = dynamics.added_wrench(with_formula(dict.fromkeys(terms, 1.0)), ['formula'])
     assert np.isfinite([np.ravel(made(*state)) for state in states()]).all()
     for term in terms:
-        assert words_of(term) and symbols_of(term) and size_of(term, 30.0, 0.3) > 0
-    assert unit_of('force: velocity * speed') == 'N s^2/m^2'
-    assert unit_of('torque: torque_x') == '1'
-    assert unit_of('rotor_torque: turning * spin') == 'N m s'
+        assert all(described(term)) and size_of(term, 30.0, 0.3) > 0
+    assert described('force: velocity * speed')[0] == 'N s^2/m^2'
+    assert described('torque: torque_x')[0] == '1'
+    assert described('rotor_torque: turning * spin')[0] == 'N m s'
     level = library(torques=False, tilting=False)
     assert not any('torque' in parsed(term)[0] or 'tilt_rate' in term for term in level)
 

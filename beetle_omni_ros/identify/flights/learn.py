@@ -9,9 +9,9 @@ terms while their evidence, with the prior of one set among all sets, rises.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime, timezone
-from math import exp, log
+from math import log
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +19,12 @@ from scipy.stats import t as student
 import yaml
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.evidence import Solution
-from beetle_omni_ros.identify.flights.page import label, listed
+from beetle_omni_ros.identify.flights.page import label
 from beetle_omni_ros.identify.flights.quality import errors
 from beetle_omni_ros.identify.flights.results import CROWD, effect_of, named_of, result_of
 from beetle_omni_ros.identify.robot_file import rounded
 from beetle_omni_ros.model.files import write_text
-from beetle_omni_ros.model.formula import library, unit_of
+from beetle_omni_ros.model.formula import described, library
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
@@ -55,12 +53,15 @@ def learned(run: Callable[[RobotParameters, Callable], dict], robot: RobotParame
         raise ParameterError(f'--learn: expected a robot file without the effect {FORMULA}')
     if result['verdict'] in NOTHING:
         return _none(result, NOTHING[result['verdict']])
-    used = {name: group['used'] for name, group in result['groups'].items()}
-    terms = library(used['torque'], used['joint'])
-    search = Search(result, terms)
+    terms = library(*(result['groups'][name]['used'] for name in ('torque', 'joint')))
+    found: list = []
+
+    def then(*given):
+        found.append(_formula(terms, result, *given))
+        return {}
     run(replace(robot, effects=robot.effects | {FORMULA: {
-        'expressions': terms, 'coefficients': (0.0,) * len(terms)}}), search)
-    return search.found
+        'expressions': terms, 'coefficients': (0.0,) * len(terms)}}), then)
+    return found[0] if isinstance(found[0], dict) else _none(result, found[0])
 
 
 def _none(result, reason):
@@ -68,118 +69,91 @@ def _none(result, reason):
         *result['findings'], f'No formula: {reason}']}
 
 
-@dataclass
-class Search:
-    """Takes a formula from the solution of an engine whose entries include the ``terms``."""
+def _formula(terms, before, engine, solution, result, starts, judges):
+    """
+    Results with a formula of the engine whose entries include the ``terms``, or why there is none.
 
-    before: dict
-    terms: tuple[str, ...]
+    ``before`` are the results of the catalogue alone.
+    """
+    judge, entries, best = solution.judge, solution.entries, set(solution.best)
 
-    def __call__(self, engine: Engine, solution: Solution, result: dict, starts: dict | None,
-                 judges: Sequence) -> dict:
-        """Set :attr:`found`, the results; nothing is added to those of this engine."""
-        found = self._formula(engine, solution, result, starts, judges)
-        self.found = found if isinstance(found, dict) else _none(self.before, found)
-        return {}
+    def gain(one, other):
+        return engine.gain(judge, tuple(sorted(one)), tuple(sorted(other)))
+    own = sorted((k for k in best if entries[k].name == FORMULA),
+                 key=lambda k: -gain(best, best - {k}))
+    if not own:
+        return f'none of {len(terms)} terms has enough evidence beside the catalogue'
+    rest, own = best - set(own), own[:MOST]
+    accepted = {label(row) for row in before['candidates'] if row['accepted']}
+    known = {k for k, entry in enumerate(entries) if not entry.varying and label(
+        {'name': entry.name, 'rotor': entry.member}) in accepted}
+    more = min(gain(rest | set(own), other) for other in (rest, known, rest | known))
+    if more < log(1 / engine.alpha):
+        return 'it would not be more probable than the entries of the catalogue'
+    at, after, floor, closure = errors(engine, solution, own, judges)
+    chance = 0.0
+    if not result['held_out']:
+        chance, closure = _repeats(engine, judge, own, rest)
+    if closure is None or closure < CLOSED or chance > engine.alpha:
+        return f'the best one of {MOST} terms closes {max(closure or 0, 0):.0%} of the gap on ' \
+            'what was not fitted'
+    keys = engine.flights[0].keys
+    named = [(k, [j for j in members if entries[j].name != FORMULA]) for k, members in named_of(
+        engine, solution, engine.alpha) if entries[k].name != FORMULA]
+    effects = [effect_of(solution, engine, keys, k, members, starts)
+               for k, members in named if len(members) < CROWD]
+    each = [effect_of(solution, engine, keys, k, [k]) for k in own]
+    sizes = {term: effect['parameters']['coefficients'] | {'unit': described(term)[0]}
+             for term, effect in zip((terms[entries[k].member - 1] for k in own), each)}
+    effects.append({**each[0], 'members': [FORMULA], 'term': None, 'expressions': list(sizes),
+                    'parameters': sizes})
+    return result_of(
+        'named_set' if any(len(effect['members']) > 1 for effect in effects) else 'named',
+        before['groups'], **{key: before[key] for key in (
+            'hidden', 'findings', 'held_out', 'next_flight', 'meta')},
+        **{key: result[key] for key in (
+            'where', 'closure', 'gap_before', 'gap_after', 'noise_floor', 'tolerances',
+            'false_alarm_probability')}, effects=effects,
+        candidates=[row for row in result['candidates'] if row['name'] != FORMULA]) | {FORMULA: {
+            'ln_bayes_factor': more, 'closure': closure, 'gap_before': at / floor,
+            'gap_after': after / floor, 'terms_tried': len(terms),
+            'ranges': ranges(engine.flights)}}
 
-    def _formula(self, engine, solution, result, starts, judges):
-        """Results with a formula, or the reason why there is none."""
-        entries, best = solution.entries, set(solution.best)
-        own = sorted((k for k in best if entries[k].name == FORMULA), key=lambda k: -engine.gain(
-            solution.judge, solution.best, tuple(sorted(best - {k}))))
-        if not own:
-            return f'none of {len(self.terms)} terms has enough evidence beside the catalogue'
-        rest, own = best - set(own), own[:MOST]
-        best = rest | set(own)
-        accepted = {label(row) for row in self.before['candidates'] if row['accepted']}
-        known = {k for k, entry in enumerate(entries) if not entry.varying and label(
-            {'name': entry.name, 'rotor': entry.member}) in accepted}
-        gain = min(engine.gain(solution.judge, tuple(sorted(best)), tuple(sorted(other)))
-                   for other in (rest, known, rest | known))
-        if gain < log(1 / engine.alpha):
-            return 'a formula is not more probable than the entries of the catalogue'
-        before, after, floor, closure = errors(engine, solution, own, judges)
-        chance = 0.0
-        if not result['held_out']:
-            chance, closure = self._repeats(engine, solution, own, rest)
-        if closure is None or closure < CLOSED or chance > engine.alpha:
-            return f'the best one of {MOST} terms closes ' + (
-                'nothing' if closure is None else f'{max(closure, 0):.0%}') \
-                + ' of the gap on what was not fitted'
-        return self._accepted(engine, solution, result, starts, own, judges) | {FORMULA: {
-            'ln_bayes_factor': gain, 'probability': exp(-gain), 'closure': closure,
-            'gap_before': before / floor, 'gap_after': after / floor,
-            'terms_tried': len(self.terms), 'ranges': ranges(engine.flights)}}
 
-    def _repeats(self, engine, solution, own, rest):
-        """
-        Probability by chance, and closure, of blocks that a fit of the others predicts.
+def _repeats(engine, judge, own, rest):
+    """
+    Probability by chance, and closure, of blocks that a fit of the others predicts.
 
-        All other keys are as fitted without the formula, and move with it.
-        """
-        index = engine.indices(own)
-        judge = solution.judge
-        without = judge.posterior(engine.indices(tuple(rest))).theta
-        direction = judge.covariance[:, index] @ np.linalg.inv(
-            judge.covariance[np.ix_(index, index)])
-        equations = judge.equations
-        score = (equations.scores - equations.slopes @ without) @ direction
-        info = direction.T @ equations.slopes @ direction
-        prior = np.diag((3 * judge.typical[index])**-2.0)
-        moved = np.linalg.solve(info.sum(axis=0) - info + prior,
-                                (score.sum(axis=0) - score)[:, :, None])[:, :, 0]
-        whole = np.linalg.solve(info.sum(axis=0) + prior, score.sum(axis=0))
-        gains, most = (np.einsum('bi,bi->b', score, w) - 0.5 * np.einsum(
-            'bi,bij,bj->b', w, info, w) for w in (moved, np.tile(whole, (len(score), 1))))
-        value = gains.mean() / gains.std(ddof=1) * len(gains)**0.5
-        return float(student.sf(value, len(gains) - 1)), float(gains.sum() / most.sum())
-
-    def _accepted(self, engine, solution, result, starts, own, judges):
-        """Results of the catalogue's entries and the formula together."""
-        keys = engine.flights[0].keys
-        own_set = [(k, [j for j in members if solution.entries[j].name != FORMULA])
-                   for k, members in named_of(engine, solution, engine.alpha)
-                   if solution.entries[k].name != FORMULA]
-        named = [(k, members) for k, members in own_set if len(members) < CROWD]
-        each = {self.terms[solution.entries[k].member - 1]: effect_of(
-            solution, engine, keys, k, [k], starts) for k in own}
-        for term, effect in each.items():
-            effect['parameters']['coefficients']['unit'] = unit_of(term)
-        first = next(iter(each.values()))
-        formula = first | {'members': [FORMULA], 'expressions': list(each), 'parameters': {
-            term: effect['parameters']['coefficients'] for term, effect in each.items()}}
-        formula.pop('term')
-        effects = [*(effect_of(solution, engine, keys, k, members, starts)
-                     for k, members in named), formula]
-        before, after, floor, closure = errors(
-            engine, solution, [*own, *(k for k, _ in named)], judges)
-        return result_of(
-            'named_set' if any(len(m) > 1 for _, m in named) else 'named',
-            self.before['groups'], **{key: self.before[key] for key in (
-                'hidden', 'findings', 'held_out', 'next_flight', 'meta')},
-            effects=effects, where=result['where'], closure=closure, gap_before=before / floor,
-            gap_after=after / floor, noise_floor=1.0, candidates=[
-                row for row in result['candidates'] if row['name'] != FORMULA],
-            tolerances={key: value for key, value in result['tolerances'].items()
-                        if not key.startswith(FORMULA)},
-            false_alarm_probability=exp(min(0.0, -solution.e_value)))
+    All other keys are as fitted with the entries ``rest``, and move with those of ``own``.
+    """
+    index, without = engine.indices(own), judge.posterior(engine.indices(tuple(rest))).theta
+    move = judge.covariance[:, index] @ np.linalg.inv(judge.covariance[np.ix_(index, index)])
+    score = (judge.equations.scores - judge.equations.slopes @ without) @ move
+    info = move.T @ judge.equations.slopes @ move
+    prior = np.diag((3 * judge.typical[index])**-2.0)
+    others = np.linalg.solve(info.sum(axis=0) - info + prior,
+                             (score.sum(axis=0) - score)[:, :, None])[:, :, 0]
+    every = np.linalg.solve(info.sum(axis=0) + prior, score.sum(axis=0))
+    gains, most = (np.einsum('bi,bi->b', score, w) - 0.5 * np.einsum('bi,bij,bj->b', w, info, w)
+                   for w in (others, np.tile(every, (len(score), 1))))
+    value = gains.mean() / gains.std(ddof=1) * len(gains)**0.5
+    return float(student.sf(value, len(gains) - 1)), float(gains.sum() / most.sum())
 
 
 def ranges(flights: Sequence) -> dict[str, list[float]]:
     """Quantity with its unit -> smallest and largest value in the flights, without extremes."""
     motion = {name: np.concatenate([flight.motion[name] for flight in flights])
               for name in ('velocity', 'rate', 'tilt', 'position')}
-    quantities = {'speed [m/s]': np.linalg.norm(motion['velocity'], axis=1),
-                  'rate of turn [rad/s]': np.linalg.norm(motion['rate'], axis=1),
-                  'tilt [rad]': motion['tilt'].ravel(), 'height [m]': motion['position'][:, 2]}
-    return {name: [rounded(float(x)) for x in np.quantile(values, RANGE)]
-            for name, values in quantities.items()}
+    return {name: [rounded(float(x), 2) for x in np.quantile(values, RANGE)] for name, values in {
+        'speed [m/s]': np.linalg.norm(motion['velocity'], axis=1),
+        'rate of turn [rad/s]': np.linalg.norm(motion['rate'], axis=1),
+        'tilt [rad]': motion['tilt'], 'height [m]': motion['position'][:, 2]}.items()}
 
 
 def write_effect(path: Path, result: dict, robot: RobotParameters) -> None:
     """Write the formula of the ``result`` as a file of an effect; ``robot``: it was found for."""
-    effect, found = next(e for e in result['effects'] if 'expressions' in e), result[FORMULA]
-    sizes = [effect['parameters'][term] for term in effect['expressions']]
+    *beside, effect = result['effects']
+    sizes = effect['parameters'].values()
     content = {
         'expressions': effect['expressions'],
         'coefficients': [rounded(size['value']) for size in sizes],
@@ -189,10 +163,9 @@ def write_effect(path: Path, result: dict, robot: RobotParameters) -> None:
             'written_by': f'beetle_omni gap --learn {__version__}',
             'date': datetime.now(timezone.utc).strftime('%Y-%m-%d'),
             **{key: result['meta'][key] for key in ('runs', 'holdout', 'robot')},
-            'robot_hash': robot.hash(), 'beside': listed(
-                [label(e) for e in result['effects'] if e is not effect]),
-            **{key: rounded(found[key]) for key in ('ln_bayes_factor', 'closure')},
-            'terms_tried': found['terms_tried'], 'ranges': found['ranges']}}
+            'robot_hash': robot.hash(), 'beside': [label(each) for each in beside],
+            **{key: rounded(found) if isinstance(found, float) else found
+               for key, found in result[FORMULA].items()}}}
     write_text(path, '# An effect for robot files, `effects: {formula: FILE}`. SI units; '
                'intervals of 95 %; see docs/gap.md.\n'
                + yaml.safe_dump(content, sort_keys=False, width=95), 'effect')

@@ -11,7 +11,7 @@ import numpy as np
 from beetle_omni_ros.identify.recording.bag import Recording
 from beetle_omni_ros.identify.recording.topics import begin_of
 from beetle_omni_ros.model.effects import CATALOGUE
-from beetle_omni_ros.model.formula import symbols_of, words_of
+from beetle_omni_ros.model.formula import described
 from beetle_omni_ros.show import figures
 from beetle_omni_ros.show.page import ABSENT, Grid, html, page, section, verdict_head
 
@@ -186,19 +186,20 @@ def _effects(result):
 
 
 def _formula(result):
-    found, effect = result.get('formula', {}), next(
-        (e for e in result['effects'] if 'expressions' in e), None)
-    if effect is None:
+    found = result.get('formula', {})
+    if 'ranges' not in found:
         return Grid('', [], [])
-    rows = [[symbols_of(term), words_of(term), f"{size['value']:.3g} {size['unit']}",
-             _spans(size['interval'])] for term, size in effect['parameters'].items()]
-    where = listed([f'{name} {low:.2g} to {high:.2g}'
+    rows = []
+    for term, size in result['effects'][-1]['parameters'].items():
+        unit, words, symbols = described(term)
+        rows.append([symbols, words, f"{size['value']:.3g} {unit}", _spans(size['interval'])])
+    where = listed([f'{name} {low:g} to {high:g}'
                     for name, (low, high) in found['ranges'].items()])
     return Grid('Formula', ['term', 'in words', 'k', '95 %'], rows, note=(
         f"Error over noise floor without it {found['gap_before']:.2f}, with it "
-        f"{found['gap_after']:.2f}; it closes {found['closure']:.0%} on {flown(result)}. ln B "
-        f"{found['ln_bayes_factor']:.0f} after the choice among {found['terms_tried']} terms. It "
-        f'holds where it was determined: {where}.'))
+        f"{found['gap_after']:.2f}; closure {found['closure']:.0%} on what was not fitted. ln B "
+        f"{found['ln_bayes_factor']:.0f} after the choice among {found['terms_tried']} terms. "
+        f'Determined at {where}.'))
 
 
 def _gap(result):
