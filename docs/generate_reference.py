@@ -248,18 +248,22 @@ def effects() -> str:
     """The catalogue of effects."""
     from beetle_omni_ros.identify.flights.treatment import TREATMENTS
     from beetle_omni_ros.model.effects import CATALOGUE, CONSUMERS, ignored
+    from beetle_omni_ros.model.formula import SCALARS, TARGETS
+    scalars = list(SCALARS)
     apart: dict[tuple, list] = {}
     for name in CATALOGUE:
         for key, consumer in CONSUMERS.items():
             if reason := ignored(key, name):
                 apart.setdefault((consumer, reason), []).append(f'`{name}`')
     rows = [[f'`{name}`', f'`{key}`', spec.unit, _neutral(spec.neutral),
-             f'{_number(spec.low)} to {_number(spec.high)}', 'not fitted' if spec.form
+             '' if spec.text else f'{_number(spec.low)} to {_number(spec.high)}',
+             'not fitted' if spec.form
              else _number(TREATMENTS[name].sizes[key].typical),
              '' if spec.form else _number(TREATMENTS[name].sizes[key].smallest),
              '' if spec.default is None else _neutral(spec.default),
              entry.settings.get(key) and f'`{entry.settings[key]}`' or '',
-             '4, one for each ' + entry.each if entry.each
+             'one for each term' if entry.each == 'term'
+             else '4, one for each ' + entry.each if entry.each
              else '1, or 4 for each joint' if spec.of_each
              else str(len(spec.neutral)) if isinstance(spec.neutral, tuple) else '1']
             for name, entry in CATALOGUE.items()
@@ -282,6 +286,16 @@ def effects() -> str:
             'that has a *default*.\n\n'
             + table(['effect', 'parameter', 'unit', 'neutral', 'range', 'typical', 'smallest',
                      'default', 'replaces', 'numbers'], rows)
+            + '\n## Formula\n\n'
+            + _wrapped('An expression of the effect `formula` is TARGET: VECTOR * SCALAR * ..., '
+                       'a thrust has no vector. Terms of rotors are summed over the rotors, and '
+                       'also admit ' + ', '.join(scalars[3:]) + '. Velocities of rotors are those '
+                       'of the hubs. Thrusts are relative to that in hover, and `ground` is '
+                       '(0.25 m / height)^2.') + '\n\n'
+            + table(['target', 'vectors', 'scalars'],
+                    [[f'`{name}`', ', '.join(vectors), ', '.join(scalars[:3])
+                      + (' and those of rotors' if rotors else '')]
+                     for name, (_, _, vectors, rotors) in TARGETS.items()])
             + '\n## Consumers\n\n'
             + _wrapped(f'The consumers are {", ".join(CONSUMERS.values())}. Every effect acts in '
                        'each of them, except for these. `test/gap/test_consumers.py` tests every '
@@ -307,7 +321,7 @@ def _acts(entry) -> str:
 def _neutral(value) -> str:
     values = set(value) if isinstance(value, tuple) else {value}
     one = values.pop()
-    return 'robot file' if one != one else _number(one)
+    return f'`{one}`' if isinstance(one, str) else 'robot file' if one != one else _number(one)
 
 
 def python() -> str:
