@@ -78,9 +78,9 @@ def test_flights_that_the_robot_file_explains_have_no_formula():
     assert result['findings'] == [f"No formula: {result['formula']['reason']}"]
 
 
-def test_nothing_is_learned_without_a_gap_or_beside_a_formula():
-    result = learned(None, ROBOT, {'verdict': 'no_gap', 'findings': []})
-    assert result['findings'] == ['No formula: model and measurement agree']
+def test_nothing_is_learned_from_bad_data_or_beside_a_formula():
+    result = learned(None, ROBOT, {'verdict': 'bad_data', 'findings': []})
+    assert result['findings'] == ['No formula: the recordings cannot be used']
     robot = replace(ROBOT, effects={'formula': {'expressions': ('force: velocity',),
                                                 'coefficients': (0.1,)}})
     with pytest.raises(ParameterError, match='without the effect formula'):

@@ -31,7 +31,6 @@ from beetle_omni_ros.model.schema import ParameterError
 FORMULA = 'formula'
 MOST = 3                # terms
 CLOSED = 0.5            # least closure on what was not fitted
-NOTHING = {'no_gap': 'model and measurement agree', 'bad_data': 'the recordings cannot be used'}
 RANGE = 0.02, 0.98      # quantiles of the motion that are stated
 
 
@@ -51,8 +50,8 @@ def learned(run: Callable[[RobotParameters, Callable], dict], robot: RobotParame
     """
     if FORMULA in robot.effects:
         raise ParameterError(f'--learn: expected a robot file without the effect {FORMULA}')
-    if result['verdict'] in NOTHING:
-        return _none(result, NOTHING[result['verdict']])
+    if result['verdict'] == 'bad_data':
+        return _none(result, 'the recordings cannot be used')
     terms = library(*(result['groups'][name]['used'] for name in ('torque', 'joint')))
     found: list = []
 
