@@ -37,7 +37,7 @@ def with_effect(name):
         else:
             values[parameter] = np.array(spec.neutral) + size.typical
     return replace(ROBOT, effects={name: {
-        key: tuple(value.tolist()) if np.ndim(value) else float(value)
+        key: tuple(np.asarray(value).tolist()) if np.ndim(value) else float(value)
         for key, value in values.items()}})
 
 
