@@ -289,11 +289,11 @@ def effects() -> str:
             + '\n## Formula\n\n'
             + _wrapped('An expression of the effect `formula` is TARGET: VECTOR * SCALAR * ..., '
                        'a thrust has no vector. Terms of rotors are summed over the rotors, and '
-                       'also admit ' + ', '.join(scalars[3:]) + '. Velocities of rotors are those '
+                       'also admit ' + ', '.join(scalars[2:]) + '. Velocities of rotors are those '
                        'of the hubs. Thrusts are relative to that in hover, and `ground` is '
                        '(0.25 m / height)^2.') + '\n\n'
             + table(['target', 'vectors', 'scalars'],
-                    [[f'`{name}`', ', '.join(vectors), ', '.join(scalars[:3])
+                    [[f'`{name}`', ', '.join(vectors), ', '.join(scalars[:2])
                       + (' and those of rotors' if rotors else '')]
                      for name, (_, _, vectors, rotors) in TARGETS.items()])
             + '\n## Consumers\n\n'

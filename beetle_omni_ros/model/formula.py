@@ -26,21 +26,12 @@ AXES = [ca.DM([1, 0, 0]), ca.DM([0, 1, 0]), ca.DM([0, 0, 1])]
 
 @dataclass(frozen=True)
 class Factor:
-    """
-    A scalar or vector (3,) in base_link of the motion.
+    """A scalar or vector (3,) in base_link of the motion."""
 
-    Attributes:
-        unit: powers of N, m and s.
-        size: usual size in flight, in SI units, of N: of weight, of N m: of weight times arm.
-        symbol: in a formula.
-        of: (quantities, rotor) -> value; the rotor is 0 to 3.
-
-    """
-
-    unit: tuple[int, int, int]
-    size: float
+    unit: tuple[int, int, int]  # powers of N, m and s
+    size: float         # usual in flight, in SI units; of N: of weight, of N m: of weight and arm
     symbol: str
-    of: Callable
+    of: Callable        # (quantities, rotor 0 to 3) -> value
 
 
 class Quantities:
@@ -65,11 +56,6 @@ class Quantities:
         place = self.position + self.terms.rotor_positions[i]
         return (NEAR / ca.fmax(ca.dot(self.world[2], place), LEAST_HEIGHT))**2
 
-    def turning(self, i):
-        """Change of the thrust direction [1/s]."""
-        turn = self.rate + self.terms.tilt_rate[i] * self.terms.tilt_axes[i]
-        return ca.cross(turn, self.normals[i])
-
 
 def length(vector):
     """Length of a vector (3,), with finite slopes."""
@@ -78,11 +64,10 @@ def length(vector):
 
 ONE, SPEED, RATE, LENGTH, FORCE, TORQUE = (
     (0, 0, 0), (0, 1, -1), (0, 0, -1), (0, 1, 0), (1, 0, 0), (1, 1, 0))
-# Of the body, then of a rotor: v velocity of body or hub, f thrust, q tilt, n thrust direction, a
-# arm, each over its value in hover where that has no unit.
+# v: velocity of body or hub, f: thrust over that in hover, q: tilt, n: thrust direction, a: arm.
+# The first two are of the body.
 SCALARS = {
     'speed': Factor(SPEED, 1.0, '|v|', lambda q, i: length(q.velocity)),
-    'climb': Factor(SPEED, 0.5, 'v_Z', lambda q, i: q.terms.velocity[2]),
     'turn': Factor(RATE, 1.0, '|w|', lambda q, i: length(q.rate)),
     'thrust': Factor(ONE, 1.0, 'f', lambda q, i: q.thrust[i]),
     'rotor_speed': Factor(ONE, 1.0, 'sqrt(f)', lambda q, i: q.speeds[i]),
@@ -110,8 +95,10 @@ VECTORS = {
     'lean': Factor(ONE, 0.5, 'z x Z', lambda q, i: ca.cross(AXES[2], q.world[2])),
     'total_force': Factor(FORCE, 1.0, 'sum(f n)', lambda q, i: q.force),
     'in_plane_velocity': Factor(SPEED, 1.0, 'v_p', lambda q, i: q.in_plane[i]),
-    'cross_velocity': Factor(SPEED, 1.0, 'n x v', lambda q, i: ca.cross(q.normals[i], q.hubs[i])),
-    'turning': Factor(RATE, 2.0, "n'", lambda q, i: q.turning(i)),
+    'normal_cross_velocity': Factor(SPEED, 1.0, 'n x v',
+                                    lambda q, i: ca.cross(q.normals[i], q.hubs[i])),
+    'turning': Factor(RATE, 2.0, "n'", lambda q, i: ca.cross(
+        q.rate + q.terms.tilt_rate[i] * q.terms.tilt_axes[i], q.normals[i])),
     'normal': Factor(ONE, 1.0, 'n', lambda q, i: q.normals[i]),
     'arm': Factor(ONE, 1.0, 'a', lambda q, i: q.terms.tilt_axes[i]),
     'side': Factor(ONE, 1.0, 'a x n', lambda q, i: ca.cross(q.terms.tilt_axes[i], q.normals[i]))}
@@ -126,19 +113,20 @@ for _k, _a in enumerate('xyz'):
                                lambda q, i, k=_k: AXES[k] * q.torque[k]),
         f'{_a}_cross_force': Factor(FORCE, 0.7, f'{_a} x sum(f n)',
                                     lambda q, i, k=_k: ca.cross(AXES[k], q.force))}
-BODY = 'x', 'y', 'z'
+FACTORS = VECTORS | SCALARS
 # Target -> symbol, words, vectors that it admits (none: a scalar), whether of all rotors.
 TARGETS: dict[str, tuple[str, str, tuple[str, ...], bool]] = {
     'force': ('F', 'force along', (
-        'velocity', *(f'velocity_{a}' for a in BODY), 'rate_cross_velocity', 'position',
-        *(f'world_{a}' for a in BODY), *BODY, 'total_force'), False),
+        'velocity', 'velocity_x', 'velocity_y', 'velocity_z', 'rate_cross_velocity', 'position',
+        'world_x', 'world_y', 'world_z', 'x', 'y', 'z', 'total_force'), False),
     'torque': ('T', 'torque along', (
-        'rate', *(f'rate_{a}' for a in BODY), 'z_cross_velocity', 'lean', *BODY,
-        *(f'torque_{a}' for a in BODY), *(f'{a}_cross_force' for a in BODY)), False),
+        'rate', 'rate_x', 'rate_y', 'rate_z', 'z_cross_velocity', 'lean', 'x', 'y', 'z',
+        'torque_x', 'torque_y', 'torque_z', 'x_cross_force', 'y_cross_force',
+        'z_cross_force'), False),
     'rotor_force': ('F_i', 'force at each rotor along', (
-        'in_plane_velocity', 'cross_velocity', 'arm', 'side'), True),
+        'in_plane_velocity', 'normal_cross_velocity', 'arm', 'side'), True),
     'rotor_torque': ('T_i', 'torque at each rotor along', (
-        'normal', 'cross_velocity', 'in_plane_velocity', 'turning', 'arm', 'side'), True),
+        'normal', 'normal_cross_velocity', 'in_plane_velocity', 'turning', 'arm', 'side'), True),
     'thrust': ('f_i', 'thrust of each rotor by', (), True)}
 # Patterns of the terms that are searched; {a|b} is a choice.
 LIBRARY = (
@@ -149,10 +137,10 @@ LIBRARY = (
     'torque: {z_cross_velocity|lean}',
     'rotor_force: in_plane_velocity{|rotor_speed|thrust}',
     'rotor_force: in_plane_velocity * rotor_speed{in_plane_speed|axial_speed}',
-    'rotor_force: {cross_velocity * spin|arm * spin|arm}{rotor_speed|thrust}',
+    'rotor_force: {normal_cross_velocity * spin|arm * spin|arm}{rotor_speed|thrust}',
     'rotor_force: side{axial_speed|tilt_acceleration}',
     'rotor_force: side * thrust{tilt_rate|tilt_sine|rotor_1|rotor_2|rotor_3|rotor_4}',
-    'rotor_torque: {cross_velocity|turning}{|rotor_speed}',
+    'rotor_torque: {normal_cross_velocity|turning}{|rotor_speed}',
     'rotor_torque: {in_plane_velocity|turning|normal|arm} * spin{rotor_speed|thrust}',
     'rotor_torque: {normal * spin * spin_up|arm * tilt_acceleration|arm * tilt_rate}',
     'rotor_torque: arm * thrust{tilt_rate|tilt_sine}',
@@ -162,55 +150,43 @@ LIBRARY = (
     'thrust: thrust{tilt_sine * tilt_sine|upright * upright|ground * upright|ground * ground}',
     'thrust: thrust{in_plane_speed * in_plane_speed|rotor_1|rotor_2|rotor_3|rotor_4}')
 OF_HEIGHT = 'ground', 'position'
+OF_ONE = 'rotor_1', 'rotor_2', 'rotor_3', 'rotor_4'
 OF_TILT = 'tilt_rate', 'tilt_acceleration', 'tilt_sine', 'turning', 'arm', 'side', 'normal'
 
 
 @cache
-def parsed(term: str) -> tuple[str, tuple[str, ...]]:
-    """
-    Target and factors of a term; the vector is the first factor.
-
-    Raises:
-        ParameterError: it is no term; the message states what is expected.
-
-    """
+def parsed(term: str) -> tuple[str, list[str], list[Factor]]:
+    """Target, names of the factors, and these, the vector first; or a ParameterError."""
     target, _, rest = str(term).partition(':')
-    factors = tuple(part.strip() for part in rest.split('*'))
+    names = [part.strip() for part in rest.split('*')]
     if target not in TARGETS:
         raise ParameterError(f'term {quoted(term)}: expected TARGET: FACTOR * FACTOR with one of '
                              f'the targets {", ".join(TARGETS)}')
     _, _, vectors, rotors = TARGETS[target]
-    scalars = SCALARS if rotors else tuple(SCALARS)[:3]
-    head, more = (factors[:1], factors[1:]) if vectors else ((), factors)
-    for part, known in (*((part, vectors) for part in head), *((part, scalars) for part in more)):
-        if part not in known:
-            raise ParameterError(f'term {quoted(term)}: factor {quoted(part)}: expected one of '
+    for k, name in enumerate(names):
+        known = vectors if vectors and not k else list(SCALARS)[:None if rotors else 2]
+        if name not in known:
+            raise ParameterError(f'term {quoted(term)}: factor {quoted(name)}: expected one of '
                                  f'{", ".join(known)}')
-    return target, factors
-
-
-def _factors(term):
-    target, names = parsed(term)
-    return target, [VECTORS[name] if TARGETS[target][2] and not k else SCALARS[name]
-                    for k, name in enumerate(names)]
+    return target, names, [FACTORS[name] for name in names]
 
 
 def described(term: str) -> tuple[str, str, str]:
     """Unit of the coefficient k of a term, the term in words, and in symbols."""
-    target, factors = _factors(term)
+    target, names, factors = parsed(term)
     symbol, words, *_ = TARGETS[target]
     powers = np.array([1, 'torque' in target, 0]) - np.sum([f.unit for f in factors], axis=0)
     over, under = ([f'{name}^{abs(p)}' if abs(p) > 1 else name
                     for name, p in zip(('N', 'm', 's'), powers, strict=True) if p * sign > 0]
                    for sign in (1, -1))
     return ((' '.join(over) or '1') + (f"/{'/'.join(under)}" if under else ''),
-            f'{words} {", times ".join(parsed(term)[1])}'.replace('_', ' '),
+            f'{words} {", times ".join(names)}'.replace('_', ' '),
             f'{symbol} += k {" ".join(f.symbol for f in factors)}')
 
 
 def size_of(term: str, weight: float, arm: float) -> float:
     """Typical coefficient of a term on a robot of this weight [N] and arm [m]."""
-    target, factors = _factors(term)
+    target, _, factors = parsed(term)
     size = float(np.prod([f.size * weight**f.unit[0] * (arm if f.unit == TORQUE else 1.0)
                           for f in factors]))
     return SHARE * weight * (arm if 'torque' in target else 1.0) / size / (
@@ -221,8 +197,8 @@ def apply(terms: Terms, expressions: tuple[str, ...], coefficients: tuple) -> No
     """Add a formula to the terms of the body's equations; without position, less its terms."""
     q, thrust = Quantities(terms), [0] * 4
     for law, coefficient in zip(expressions, coefficients, strict=True):
-        target, factors = _factors(law)
-        if terms.position is None and set(OF_HEIGHT) & set(parsed(law)[1]):
+        target, names, factors = parsed(law)
+        if terms.position is None and set(OF_HEIGHT) & set(names):
             continue
         for i in range(4 if TARGETS[target][3] else 1):
             value = coefficient
@@ -240,19 +216,11 @@ def apply(terms: Terms, expressions: tuple[str, ...], coefficients: tuple) -> No
 
 
 def library(torques: bool = True, tilting: bool = True) -> tuple[str, ...]:
-    """
-    Terms among which a formula is searched.
-
-    Args:
-        torques: whether torques are measured; without, there are no terms that only turn.
-        tilting: whether the rotors tilt.
-
-    """
-    made = []
-    for pattern in LIBRARY:
-        choices = [part.split('|') for part in re.split('[{}]', pattern)]
-        made += [' * '.join(filter(None, (part.strip(' *') for part in parts))).replace(
-            ': * ', ': ') for parts in product(*choices)]
-    return tuple(term for term in dict.fromkeys(made)
-                 if (torques or parsed(term)[0] not in ('torque', 'rotor_torque'))
+    """Terms that are searched; of single rotors and torques if ``torques`` are measured."""
+    choices = ([part.split('|') for part in re.split('[{}]', pattern)] for pattern in LIBRARY)
+    made = [' * '.join(filter(None, (part.strip(' *') for part in parts))).replace(': * ', ': ')
+            for each in choices for parts in product(*each)]
+    return tuple(term for term in made
+                 if (torques or 'torque' not in parsed(term)[0]
+                     and not set(OF_ONE) & set(parsed(term)[1]))
                  and (tilting or not set(OF_TILT) & set(parsed(term)[1])))

@@ -18,7 +18,7 @@ SAME = {
     'body_drag': ({'coefficient': 0.1}, {'force: velocity * speed': -0.1}),
     'rotor_drag': ({'coefficient': 0.6}, {'rotor_force: in_plane_velocity * rotor_speed': -0.15}),
     'rotor_hub_moment': ({'coefficient': 0.2}, {
-        'rotor_torque: cross_velocity * rotor_speed': -0.05}),
+        'rotor_torque: normal_cross_velocity * rotor_speed': -0.05}),
     'axial_inflow': ({'per_rotor': 0.4}, {'thrust: axial_speed * rotor_speed': -0.4}),
     'translational_lift': ({'per_rotor': 0.1}, {'thrust: in_plane_speed * in_plane_speed': 0.1}),
     'ground_effect': ({'gain_at_0.25m': 0.1}, {

@@ -83,10 +83,12 @@ def _formula(terms, before, engine, solution, result, starts, judges):
     if not own:
         return f'none of {len(terms)} terms has enough evidence beside the catalogue'
     rest, own = best - set(own), own[:MOST]
+    chosen = tuple(sorted(rest | set(own)))
+    solution = replace(solution, best=chosen, posterior=judge.posterior(engine.indices(chosen)))
     accepted = {label(row) for row in before['candidates'] if row['accepted']}
     known = {k for k, entry in enumerate(entries) if not entry.varying and label(
         {'name': entry.name, 'rotor': entry.member}) in accepted}
-    more = min(gain(rest | set(own), other) for other in (rest, known, rest | known))
+    more = min(gain(chosen, other) for other in (rest, known, rest | known))
     if more < log(1 / engine.alpha):
         return 'it would not be more probable than the entries of the catalogue'
     at, after, floor, closure = errors(engine, solution, own, judges)
@@ -106,13 +108,15 @@ def _formula(terms, before, engine, solution, result, starts, judges):
              for term, effect in zip((terms[entries[k].member - 1] for k in own), each)}
     effects.append({**each[0], 'members': [FORMULA], 'term': None, 'expressions': list(sizes),
                     'parameters': sizes})
+    start, end, all_of_it, share = errors(
+        engine, solution, [*own, *(k for k, members in named if len(members) < CROWD)], judges)
     return result_of(
         'named_set' if any(len(effect['members']) > 1 for effect in effects) else 'named',
         before['groups'], **{key: before[key] for key in (
             'hidden', 'findings', 'held_out', 'next_flight', 'meta')},
         **{key: result[key] for key in (
-            'where', 'closure', 'gap_before', 'gap_after', 'noise_floor', 'tolerances',
-            'false_alarm_probability')}, effects=effects,
+            'where', 'noise_floor', 'tolerances', 'false_alarm_probability')}, effects=effects,
+        closure=share, gap_before=start / all_of_it, gap_after=end / all_of_it,
         candidates=[row for row in result['candidates'] if row['name'] != FORMULA]) | {FORMULA: {
             'ln_bayes_factor': more, 'closure': closure, 'gap_before': at / floor,
             'gap_after': after / floor, 'terms_tried': len(terms),
