@@ -2,8 +2,7 @@
 Formulas: forces and torques as sums of products of the motion, each term with one coefficient.
 
 A term is text, ``TARGET: FACTOR * FACTOR``, so that a formula is data in a file. Each target
-admits the vectors that symmetry allows. A force is a polar vector, a torque an axial one, and the
-spin of a rotor changes sign in a mirror. Terms of rotors are summed over the four rotors.
+admits the vectors that symmetry allows. Terms of rotors are summed over the four rotors.
 """
 
 from collections.abc import Callable
@@ -51,11 +50,6 @@ class Quantities:
             ca.cross(terms.rotor_positions[i], forces[i])
             - terms.spin[i] * terms.torque_ratio * forces[i] for i in range(4))
 
-    def ground(self, i):
-        """(0.25 m / height of the rotor)^2."""
-        place = self.position + self.terms.rotor_positions[i]
-        return (NEAR / ca.fmax(ca.dot(self.world[2], place), LEAST_HEIGHT))**2
-
 
 def length(vector):
     """Length of a vector (3,), with finite slopes."""
@@ -81,7 +75,8 @@ SCALARS = {
                                 lambda q, i: q.terms.tilt_acceleration[i]),
     'tilt_sine': Factor(ONE, 0.7, 'sin q', lambda q, i: ca.sin(q.terms.tilt[i])),
     'upright': Factor(ONE, 0.7, 'n_Z', lambda q, i: ca.dot(q.world[2], q.normals[i])),
-    'ground': Factor(ONE, 0.1, '(0.25 m/h)^2', lambda q, i: q.ground(i)),
+    'ground': Factor(ONE, 0.1, '(0.25 m/h)^2', lambda q, i: (NEAR / ca.fmax(ca.dot(
+        q.world[2], q.position + q.terms.rotor_positions[i]), LEAST_HEIGHT))**2),
     'spin': Factor(ONE, 1.0, 'spin', lambda q, i: q.terms.spin[i]),
     **{f'rotor_{k + 1}': Factor(ONE, 0.25, f'[rotor {k + 1}]', lambda q, i, k=k: float(i == k))
        for k in range(4)}}

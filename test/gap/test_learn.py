@@ -70,18 +70,19 @@ def test_flights_that_the_robot_file_explains_have_no_formula():
     robot = replace(ROBOT, effects={'wind': {'force': WIND}})
     recordings = [prepare(replace(read_recording(Path(flight(name))), name=name), robot, P, False)
                   for name in ('windy_0', 'windy_1')]
-    result = learned(lambda robot, then: judged(recordings, [], robot, P, then=then), robot, {
-        'verdict': 'unknown', 'findings': [], 'candidates': [],
+    result = learned(lambda robot, then: judged(
+        recordings[:1], recordings[1:], robot, P, then=then), robot, {
+        'held_out': True, 'findings': [], 'candidates': [],
         'groups': {'torque': {'used': True}, 'joint': {'used': True}}})
     assert result['formula'] == {
         'reason': f'none of {len(library())} terms has enough evidence beside the catalogue'}
     assert result['findings'] == [f"No formula: {result['formula']['reason']}"]
 
 
-def test_nothing_is_learned_from_bad_data_or_beside_a_formula():
-    result = learned(None, ROBOT, {'verdict': 'bad_data', 'findings': []})
-    assert result['findings'] == ['No formula: the recordings cannot be used']
+def test_nothing_is_learned_without_a_held_out_flight_or_beside_a_formula():
+    result = learned(None, ROBOT, {'held_out': False, 'findings': []})
+    assert 'no flight is held out' in result['findings'][0]
     robot = replace(ROBOT, effects={'formula': {'expressions': ('force: velocity',),
                                                 'coefficients': (0.1,)}})
     with pytest.raises(ParameterError, match='without the effect formula'):
-        learned(None, robot, {'verdict': 'unknown'})
+        learned(None, robot, {'held_out': True})

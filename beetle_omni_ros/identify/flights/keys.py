@@ -157,7 +157,7 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
 def _terms(robot, name, size):
     """Keys of the terms of a formula; together, narrow ones have the smallest relevant size."""
     own = robot.effects.get(name, {'expressions': (), 'coefficients': ()})
-    weight, arm = robot.mass * robot.gravity, arm_of(robot)
+    weight, arm = robot.mass * robot.gravity, ARM * size_of(robot, 'm')
     keys: dict[str, Key] = {}
     for k, (term, value) in enumerate(zip(*own.values(), strict=True)):
         typical, text = size_of_term(term, weight, arm), f'{name}.coefficients[{k}]'
@@ -233,12 +233,8 @@ class Entry:
 def size_of(robot: RobotParameters, unit: str) -> float:
     """Factor of a typical deviation with this unit for a robot of another size."""
     weight, arm = SIZE.get(unit, (0, 0))
-    return (robot.mass * robot.gravity / WEIGHT)**weight * (arm_of(robot) / ARM)**arm
-
-
-def arm_of(robot: RobotParameters) -> float:
-    """Mean distance of the rotors from the axis of base_link [m]."""
-    return float(np.linalg.norm(robot.rotors.positions[:, :2], axis=1).mean())
+    length = float(np.linalg.norm(robot.rotors.positions[:, :2], axis=1).mean())
+    return (robot.mass * robot.gravity / WEIGHT)**weight * (length / ARM)**arm
 
 
 def keys_of(robot: RobotParameters, names: set[str]) -> dict[str, Key]:
@@ -254,7 +250,7 @@ def prior_of(robot: RobotParameters, key: Key, tolerance: float, stamps: float) 
     plain = f'{key.effect}.{key.parameter}'
     flight = FLIGHT.get(plain, 0.0)
     if plain == 'centre_of_mass.offset':
-        flight = FLIGHT_OFFSET * arm_of(robot)
+        flight = FLIGHT_OFFSET * ARM * size_of(robot, 'm')
     if plain == 'rotor_dead_time.delay':
         flight = max(flight, stamps)
     typical = AIR * TREATMENTS['rotor_drag'].sizes['coefficient'].typical if (

@@ -105,8 +105,6 @@ def _effect_text(effect):
     sizes = ', '.join(_size(v, span) for v, span in zip(values, spans, strict=True))
     unit = '' if found['unit'] == '1' else f' {found["unit"]}'
     what = f'{parameter}; ' if len(CATALOGUE[effect['names'][0]].parameters) > 1 else ''
-    if more := len(effect['parameters']) - 1 if 'expressions' in effect else 0:
-        what = f'{more} more below; {what}'
     file = ', '.join(f'{value:.3g}' for value in own) + unit if any(own) else 'none'
     return f'{" or ".join(names)}{member} of {sizes}{unit} ({what}robot file: {file})'
 
@@ -196,10 +194,9 @@ def _formula(result):
     where = listed([f'{name} {low:g} to {high:g}'
                     for name, (low, high) in found['ranges'].items()])
     return Grid('Formula', ['term', 'in words', 'k', '95 %'], rows, note=(
-        f"Error over noise floor without it {found['gap_before']:.2f}, with it "
-        f"{found['gap_after']:.2f}; closure {found['closure']:.0%} on what was not fitted. ln B "
-        f"{found['ln_bayes_factor']:.0f} after the choice among {found['terms_tried']} terms. "
-        f'Determined at {where}.'))
+        f"Error over noise floor {found['gap_before']:.2f} without it, {found['gap_after']:.2f} "
+        f"with it: closure {found['closure']:.0%}. ln B {found['ln_bayes_factor']:.0f} after the "
+        f"choice among {found['terms_tried']} terms. Determined at {where}."))
 
 
 def _gap(result):

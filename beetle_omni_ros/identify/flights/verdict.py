@@ -57,8 +57,7 @@ WEIGHED = 'mass', 'inertia'
 LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
 # Entries of the comparison of IMU and MoCap.
 SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
-# Further results, from these and the flights that judge.
-Then = Callable[[Engine, Solution, dict, Starts | None, list], dict]
+Then = Callable[[Engine, Solution, dict, Starts | None, list], dict]   # adds; last: judges
 
 def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: RobotParameters,
            p: GapParameters, alpha: float = ALPHA, then: Then | None = None) -> dict:
