@@ -77,10 +77,16 @@ def _formula(terms, before, engine, solution, result, starts, judges):
         return engine.gain(judge, tuple(sorted(one)), tuple(sorted(other)))
     own = sorted((k for k in best if entries[k].name == FORMULA),
                  key=lambda k: -gain(best, best - {k}))
+    best, own = best - set(own[MOST:]), own[:MOST]
+    for k in own:       # known entries have priority in the place of a term
+        less, j = max((gain(best - {k} | {j}, best), j) for j, entry in enumerate(entries)
+                      if j not in {*best, *solution.banned} and not entry.varying
+                      and entry.name != FORMULA)
+        best = best - {k} | {j} if less > log(engine.alpha) else best
+    own = [k for k in own if k in best]
     if not own:
         return f'none of {len(terms)} terms has enough evidence beside the catalogue'
-    rest, own = best - set(own), own[:MOST]
-    chosen = tuple(sorted(rest | set(own)))
+    rest, chosen = best - set(own), tuple(sorted(best))
     solution = replace(solution, best=chosen, posterior=judge.posterior(engine.indices(chosen)))
     accepted = {label(row) for row in before['candidates'] if row['accepted']}
     known = {k for k, entry in enumerate(entries) if not entry.varying and label(
