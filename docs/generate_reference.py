@@ -287,15 +287,12 @@ def effects() -> str:
             + table(['effect', 'parameter', 'unit', 'neutral', 'range', 'typical', 'smallest',
                      'default', 'replaces', 'numbers'], rows)
             + '\n## Formula\n\n'
-            + _wrapped('An expression of the effect `formula` is TARGET: VECTOR * SCALAR * ..., '
-                       'a thrust has no vector. Terms of rotors are summed over the rotors, and '
-                       'also admit ' + ', '.join(scalars[2:]) + '. Velocities of rotors are those '
-                       'of the hubs. Thrusts are relative to that in hover, and `ground` is '
-                       '(0.25 m / height)^2.') + '\n\n'
-            + table(['target', 'vectors', 'scalars'],
-                    [[f'`{name}`', ', '.join(vectors), ', '.join(scalars[:2])
-                      + (' and those of rotors' if rotors else '')]
-                     for name, (_, _, vectors, rotors) in TARGETS.items()])
+            + _wrapped('An expression of `formula` is TARGET: VECTOR * SCALAR * ..., a thrust has '
+                       'no vector. ' + ' '.join(f'`{name}`: {", ".join(vectors)}.' for name, (
+                           _, _, vectors, _) in TARGETS.items() if vectors)
+                       + f' Scalars: {", ".join(scalars[:2])}; of rotors, which are summed, also '
+                       + ', '.join(scalars[2:]) + '. Velocities are those of the hubs, thrusts '
+                       'relative to hover, `ground` is (0.25 m / height)^2.') + '\n'
             + '\n## Consumers\n\n'
             + _wrapped(f'The consumers are {", ".join(CONSUMERS.values())}. Every effect acts in '
                        'each of them, except for these. `test/gap/test_consumers.py` tests every '

@@ -133,8 +133,7 @@ class Effect:
     apply: Callable | None = None
     # Equation of a joint effect, which changes ServoTerms: servo(terms, joint, **values).
     servo: Callable | None = None
-    # 'rotor' or 'joint' if the parameters are (4,), one for each; 'term': one for each expression
-    each: str = ''
+    each: str = ''      # 'rotor' or 'joint' if parameters are (4,), 'term': one each expression
     # Delayed quantities: 'tilt' and 'thrust' commands, readings of 'imu', 'mocap', 'encoders'.
     delays: tuple[str, ...] = ()
     allocated: bool = False     # the allocation includes it

@@ -36,14 +36,8 @@ def learned(run: Callable[[RobotParameters, Callable], dict], robot: RobotParame
     """
     Results of flights with a formula, or with the reason why there is none.
 
-    Args:
-        run: results of the flights for a robot, to which a function may add.
-        robot: of the ``result`` of the catalogue alone.
-        result: of the catalogue alone.
-
-    Raises:
-        ParameterError: the robot file has a formula already.
-
+    ``run`` makes results for a robot, to which a function may add. ``result`` is that of ``robot``
+    with the catalogue alone. A ParameterError, if the robot has a formula already.
     """
     if FORMULA in robot.effects:
         raise ParameterError(f'--learn: expected a robot file without the effect {FORMULA}')
@@ -138,10 +132,9 @@ def write_effect(path: Path, result: dict, robot: RobotParameters) -> None:
     *beside, effect = result['effects']
     sizes = effect['parameters'].values()
     content = {
-        'expressions': effect['expressions'],
+        'expressions': effect['expressions'], 'units': [size['unit'] for size in sizes],
         **{f'{key}s': [np.vectorize(rounded)(size[name]).tolist() for size in sizes]
            for key, name in (('coefficient', 'value'), ('interval', 'interval'))},
-        'units': [size['unit'] for size in sizes],
         'source': {
             'written_by': f'beetle_omni gap --learn {__version__}',
             **{key: result['meta'][key] for key in ('runs', 'holdout', 'robot')},
