@@ -42,7 +42,7 @@ class TimedNetwork:
     """The network of a policy, with the CPU ``times`` [s] of its calls."""
 
     def __init__(self, network):
-        self._network, self.reset = network, network.reset
+        self._network = network
         self.times: list[float] = []
 
     def __call__(self, observation):

@@ -43,8 +43,6 @@ FILES = {
     'rl_bare.yaml': ('control.policy:PolicyParameters', 'The policy without guidance.'),
     'rl_any.yaml': ('control.policy:PolicyParameters',
                        'The policy with the estimated disturbance as input.'),
-    'rl_late.yaml': ('control.policy:PolicyParameters',
-                     'The policy that observes its last steps.'),
     'rl_published.yaml': ('control.policy:PolicyParameters',
                           'The policy of train_published.yaml.'),
     'hover.yaml': ('control.hover:HoverParameters', 'The hover controller.'),
@@ -62,8 +60,6 @@ FILES = {
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
     'train_any.yaml': ('train.parameters:TrainParameters',
                        'The training for robots that differ.'),
-    'train_late.yaml': ('train.parameters:TrainParameters',
-                        'What a training for robots with late commands and joints changes.'),
     'train_published.yaml': ('train.parameters:TrainParameters',
                              'The training with the settings of the publication.'),
     'gap.yaml': ('identify.recording.parameters:GapParameters', 'The gap finder.')}
@@ -326,7 +322,7 @@ def python() -> str:
     import beetle_omni_ros as module
     from beetle_omni_ros.bags import log
     from beetle_omni_ros.control import base
-    from beetle_omni_ros.show.notebook import NotebookLog
+    from beetle_omni_ros.show.report import NotebookLog
     text = [f'# Python\n\n{MADE}\n{TIMES}']
     for name in module.__all__:
         found = getattr(module, name)

@@ -31,7 +31,7 @@ LIMIT = np.repeat([60.0, 5.0, 0.3], [3, 3, 4])  # of the estimates [N], [N m], [
 TILT_CORRECTION = 0.2   # share of a measured tilt error that corrects the tilt model in each step
 # Initial standard deviations of predicted accelerations [m/s^2], [rad/s^2] and of tilts [rad].
 MOTION_NOISE, TILT_NOISE = np.repeat([0.3, 3.0], 3), np.full(4, 0.01)
-BLOCK = 0.035       # [s] mean accelerations over more than this give the delay: four steps
+BLOCK = 0.075       # [s] mean accelerations over more than this give the delay: eight steps
 HISTORY = 64        # number of stored states and commands, more than any latency needs
 
 

@@ -2,7 +2,6 @@
 
 from collections import deque
 from dataclasses import dataclass
-from math import inf
 
 import numpy as np
 
@@ -16,7 +15,6 @@ from beetle_omni_ros.model.rotations import entries
 from beetle_omni_ros.model.schema import parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
-LONGEST_STEP = 0.1      # [s] between two states; after a longer gap the history is empty
 LATEST = 10             # steps within which a command is reported as the executed command
 COMMAND_DELAY = 0.01    # [s] from the state stamp to the actuators, for the disturbance estimate
 # An action beyond is a fault: it is sent to the supervisor unchanged; smaller ones are clipped to
@@ -75,11 +73,9 @@ class PolicyController:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the last commands, the history, the estimate and all counts."""
+        """Reset the last commands, the estimate and all counts."""
         self._steps = self._faults = self._cut = 0
         self._guidance.reset()
-        self.network.reset()
-        self._stamp = -inf
         self._latest: deque[list[float]] = deque(maxlen=LATEST)
         if self._estimator:
             self._estimator.reset()
@@ -89,9 +85,6 @@ class PolicyController:
     def step(self, state: State, target: Target) -> Command:
         """One command for one state."""
         self._steps += 1
-        if state.stamp - self._stamp > LONGEST_STEP:
-            self.network.reset()
-        self._stamp = state.stamp
         if self._matching:
             state = self._matching.observed(state)
         if self._estimator:

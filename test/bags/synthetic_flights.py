@@ -5,8 +5,8 @@ import numpy as np
 from beetle_omni_ros.bags.messages import Diagnostic
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.model import rotations
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.readings import BatteryReading, ImuReading, JointReading, PoseReading
+from beetle_omni_ros.model.rotations import BodyState
 
 TICK = 0.005
 

@@ -17,8 +17,7 @@ from servo_bench import running
 from beetle_omni_ros import cli
 from beetle_omni_ros.bags.messages import Diagnostic
 from beetle_omni_ros.drivers import device_checks, motor_board
-from beetle_omni_ros.drivers.check import run_check
-from beetle_omni_ros.drivers.findings import ObservedGraph
+from beetle_omni_ros.drivers.check import ObservedGraph, run_check
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 

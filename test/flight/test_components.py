@@ -26,10 +26,10 @@ from beetle_omni_ros.flight.loop import FlightLoop
 from beetle_omni_ros.flight.stack import ControllerComponent, Estimator, SupervisorComponent
 from beetle_omni_ros.flight.surroundings import SimulatedRobot, TaskReference
 from beetle_omni_ros.model.allocation import ActuatorHealth
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.mode import COMMAND_AGE, Mode
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.readings import ImuReading, JointReading, PoseReading
+from beetle_omni_ros.model.rotations import BodyState
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.simulator import Simulator
 from beetle_omni_ros.supervisor.interface import SupervisorParameters

@@ -8,11 +8,11 @@ from rclpy.parameter import Parameter
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.flight import component as base
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.readings import JointReading
+from beetle_omni_ros.model.rotations import BodyState
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.ros import graph
-from beetle_omni_ros.ros.control_nodes import SupervisorNode
+from beetle_omni_ros.ros.nodes import SupervisorNode
 from beetle_omni_ros.ros.runner import maker
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])

@@ -25,9 +25,8 @@ from beetle_omni_ros.model.readings import ImuReading, JointReading
 from beetle_omni_ros.model.schema import RunError
 from beetle_omni_ros.ros import wire
 from beetle_omni_ros.ros.bridge_nodes import JointBridgeNode, RotorBridgeNode
-from beetle_omni_ros.ros.control_nodes import ControllerNode, EkfNode, SupervisorNode
 from beetle_omni_ros.ros.node import FlightNode
-from beetle_omni_ros.ros.side_nodes import RecorderNode
+from beetle_omni_ros.ros.nodes import ControllerNode, EkfNode, RecorderNode, SupervisorNode
 from beetle_omni_ros.ros.sim_node import SimNode
 
 pytestmark = pytest.mark.real_time

@@ -15,10 +15,10 @@ from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import flatten
-from beetle_omni_ros.train import command
-from beetle_omni_ros.train.command import parse_changes
+from beetle_omni_ros.train import runner
 from beetle_omni_ros.train.parameters import read_parameters, TrainParameters
 from beetle_omni_ros.train.ppo import GraphPpo
+from beetle_omni_ros.train.runner import parse_changes
 
 ROBOT = RobotParameters.load()
 TINY = ['--smoke', '--device', 'cpu', '--set', 'ppo.robots=8', '--set', 'ppo.steps=4']
@@ -50,7 +50,7 @@ def test_a_run_writes_all_documented_files(run):
     result = json.loads((run.parent / 'result.json').read_text())
     assert result['policy'] == str(run / 'policy.onnx') and result['iterations'] == 3
     assert result['onnx_difference'] <= 1e-5 and result['seconds'] > 0
-    expected = read_parameters(None, {**command.SMOKE, 'seed': 5})
+    expected = read_parameters(None, {**runner.SMOKE, 'seed': 5})
     assert TrainParameters.load(run / 'train.yaml').plain() == expected.plain()
 
 
