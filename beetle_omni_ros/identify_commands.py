@@ -36,7 +36,7 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
             '--next', callback=options.writable, metavar='FILE', help=(
                 'Write a task (YAML) that decides between the candidates, for fly and '
                 'evaluate.'))] = None,
-        learn: Annotated[Path | None, Option(callback=writable, metavar='FILE', help=(
+        learn: Annotated[Path | None, Option(callback=options.writable, metavar='FILE', help=(
             'Search a formula for what no known effect explains, and write it as an effect '
             '(YAML).'))] = None,
         json_path: options.JsonOption = None):
