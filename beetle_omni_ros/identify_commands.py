@@ -36,6 +36,9 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
             '--next', callback=options.writable, metavar='FILE', help=(
                 'Write a task (YAML) that decides between the candidates, for fly and '
                 'evaluate.'))] = None,
+        learn: Annotated[Path | None, Option(callback=options.writable, metavar='FILE', help=(
+            'Search a formula for what no known effect explains, and write it as an effect '
+            '(YAML).'))] = None,
         json_path: options.JsonOption = None):
     """
     Identify and add effects that the model lacks from flights.
@@ -45,7 +48,7 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
     from beetle_omni_ros.flight.experiment import Experiments
     from beetle_omni_ros.identify.flights.command import run_gap
     return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
-                   tolerances=tolerances, form=form, alpha=alpha, next_task=next_task,
+                   tolerances=tolerances, form=form, alpha=alpha, next_task=next_task, learn=learn,
                    experiments=Experiments)
 
 

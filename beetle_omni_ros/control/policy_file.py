@@ -185,10 +185,12 @@ def robot_hash(robot: RobotParameters | dict) -> str:
 
 
 def _plain(value):
-    """Nested mapping with floats and lists of floats."""
+    """Nested mapping with floats, lists of floats and lists of text."""
     if isinstance(value, dict):
         return {key: _plain(each) for key, each in value.items()}
-    return value if value is None else np.asarray(value, dtype=float).tolist()
+    array = np.asarray(value)
+    return value if value is None else (
+        array if array.dtype.kind == 'U' else array.astype(float)).tolist()
 
 
 def _arrays(values):

@@ -25,7 +25,9 @@ EFFECTS = validated({
     'ground_effect': {'gain_at_0.25m': 0.08},
     'propeller_gyroscopic_torque': {'angular_momentum_at_hover': 0.06},
     'rotor_acceleration_torque': {'angular_momentum_at_hover': 0.03},
-    'joint_offset': {'offset': [0.03, -0.02, 0.05, 0.0]}})
+    'joint_offset': {'offset': [0.03, -0.02, 0.05, 0.0]},
+    'formula': {'expressions': ['force: velocity * speed', 'rotor_torque: turning * spin * thrust',
+                                'thrust: thrust * ground'], 'coefficients': [-0.1, 0.03, 0.2]}})
 EVERYTHING = replace(ROBOT, effects=EFFECTS)
 
 
