@@ -26,6 +26,7 @@ SAME = 0.04             # share of a typical difference between flights by which
 MOST = 8                # entries of a set
 PAIRED = 20             # entries whose pairs are all weighed; others follow from the best set
 FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
+NOTHING = 1e-9          # deviation of a discrepancy that is not there
 RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
 GROUPS = (0.0, 0.5, 2.0)    # [Hz] lower ends of the groups of bands of the test of constancy
 TURN = 1 / (2 * np.pi * GROUPS[-1])     # [s] one radian there: the phase of an answer of feedback
@@ -173,6 +174,8 @@ class Engine:
                                                           strict=False)))
                 for name, value in starts.items():
                     theta[self.index[name]] = value
+        solution.plain = self._weighing(spectra, solution.banned, np.full(
+            len(self.names) - self.known, NOTHING))
         return solution
 
     def _next(self, solution):
@@ -283,9 +286,7 @@ class Engine:
         return [self.index[key] for k in chosen for key in self.entries[k].keys]
 
     def _search(self, spectra, banned):
-        equations, keys, copies, _ = self._split(spectra, banned)
-        wide = np.tile(self.typical[keys], copies)
-        judge = self._judge(equations, form=wide, size=wide)
+        judge = self._weighing(spectra, banned, self.narrow[self.known:])
         gains: dict[tuple[int, ...], float] = {}
         total = len(self.entries)
 
@@ -326,11 +327,14 @@ class Engine:
         weight(best)
         weight(tuple(k for k in best if self.entries[k].varying))
         posterior = judge.posterior(self.indices(best))
-        bands = self._bands_of_groups()
-        own = posterior.theta[self.known:].reshape(copies, len(keys))
-        unsteady = [(int(key), own[bands, j]) for j, key in enumerate(keys)]
-        return Solution(self.names, self.entries, gains, best, posterior, equations, judge,
-                        spectra, by_band=unsteady)
+        return Solution(self.names, self.entries, gains, best, posterior, judge.equations, judge,
+                        spectra)
+
+    def _weighing(self, spectra, banned, generic):
+        """Judge of sets; ``generic`` are the prior deviations of the discrepancy."""
+        equations, keys, copies, _ = self._split(spectra, banned, generic=generic)
+        wide = np.tile(self.typical[keys], copies)
+        return self._judge(equations, form=wide, size=wide)
 
     def gain(self, judge: Judge, one: tuple[int, ...], other: tuple[int, ...]) -> float:
         """Ln of the probability of one set of entries over that of another."""
@@ -347,7 +351,7 @@ class Engine:
         """(bands,) group of each band."""
         return np.array([0, *np.searchsorted(GROUPS, EDGES[:-1], side='right') - 1])
 
-    def _split(self, spectra, banned, entry=None):
+    def _split(self, spectra, banned, entry=None, generic=None):
         """
         Normal equations with separate values for the groups of bands, and their judge.
 
@@ -360,7 +364,7 @@ class Engine:
         free = np.array([*self.indices(tuple(banned)), *(self.late if banned else ())], dtype=int)
         keys = np.concatenate([own, free])
         equations = normal(spectra, self.names, self.flight, keys, bands,
-                           self.narrow[self.known:])
+                           self.narrow[self.known:] if generic is None else generic)
         return equations, keys, copies, len(own)
 
     def _constancy(self, solution, banned):

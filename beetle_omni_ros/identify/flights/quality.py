@@ -31,9 +31,16 @@ NEAR = 12                                   # frequencies on each side that a li
 
 
 def fitted(engine: Engine, solution: Solution, k: int) -> np.ndarray:
-    """(K,) keys of flight k, without the discrepancy."""
-    x = solution.equations.of_flight(k, solution.theta)[:len(engine.names)]
-    x[:engine.known] += solution.theta[:engine.known]
+    """
+    (K,) keys of flight k, fitted without the discrepancy.
+
+    In a fit with it, tolerances and discrepancy may oppose each other, so that the fit without
+    the share of the discrepancy leaves forces that the measurements do not show.
+    """
+    assert solution.plain is not None
+    theta = solution.plain.posterior(engine.indices(solution.best)).theta
+    x = solution.plain.equations.of_flight(k, theta)[:len(engine.names)]
+    x[:engine.known] += theta[:engine.known]
     return x
 
 
@@ -118,13 +125,8 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
 
 def left_of(engine: Engine, solution: Solution) -> list[np.ndarray]:
     """(B, F, C) whitened residual of each flight after the fit, without the discrepancy."""
-    rows = []
-    for k, found in enumerate(solution.spectra):
-        rest = found.residual + found.slopes @ fitted(engine, solution, k)
-        for key, values in solution.by_band:
-            rest += found.slopes[:, :, :, key] * values[found.band][None, :, None]
-        rows.append(rest)
-    return rows
+    return [found.residual + found.slopes @ fitted(engine, solution, k)
+            for k, found in enumerate(solution.spectra)]
 
 
 @dataclass(frozen=True)
