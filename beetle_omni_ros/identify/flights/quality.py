@@ -215,9 +215,13 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
 
     """
     own = spectra[0].groups[0]
-    count = min(rest.shape[1] for rest in left)
-    first = int(np.ceil(SLOWEST / spectra[0].step))
-    rest = np.concatenate([rest[:, first:count][..., own] for rest in left])**2
+    # blocks of flights differ in length, and so do their frequencies
+    step = max(found.step for found in spectra)
+    last = min((rest.shape[1] - 1) * found.step
+               for found, rest in zip(spectra, left, strict=True))
+    frequency = step * np.arange(int(np.ceil(SLOWEST / step)), int(last / step) + 1)
+    rest = np.concatenate([rest[:, np.rint(frequency / found.step).astype(int)][..., own]
+                           for found, rest in zip(spectra, left, strict=True)])**2
     blocks, power = len(rest), rest.mean(axis=0)
     # a slope of the spectrum is no line, so the larger of both sides counts
     places = np.arange(NEAR, len(power) - NEAR)
@@ -228,10 +232,9 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
     sides = NEAR - 1
     chance = float(f_law.sf(ratio[k, c], blocks, blocks * sides)) * ratio.size
     order = np.argsort(-ratio[k])
-    frequency = (places[k] + first) * spectra[0].step
     return Unexplained('line', min(chance, 1.0), float(blocks * (
         ratio[k, c] - 1 - np.log(ratio[k, c])) / 2), tuple(channels[own[i]] for i in order[:2]),
-        float(frequency))
+        float(frequency[places[k]]))
 
 
 def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
