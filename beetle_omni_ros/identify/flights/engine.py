@@ -141,9 +141,11 @@ class Engine:
         self.typical = np.concatenate([self.typical, np.zeros(size)])
         self.flight = np.concatenate([self.flight, np.zeros(size)])
 
-    def run(self) -> Solution:
-        """Relinearise, learn the noise and search, several times."""
+    def run(self, first: dict[str, float] | None = None) -> Solution:
+        """Relinearise, learn the noise and search, several times; ``first``: deviations there."""
         theta = np.zeros(len(self.names))
+        for name, value in (first or {}).items():
+            theta[self.index[name]] = value
         etas = np.zeros((len(self.flights), len(self.names)))
         self._settle(theta, etas)
         self._learn(spectra := self._spectra(theta, etas))
