@@ -66,7 +66,7 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     body = BodyModel(robot, keys, tilting_modules(robot))
     every = [BagFlight(flight, robot, body, keys, p) for flight in [*flights, *judging]]
     models, others = every[:len(flights)], every[len(flights):]
-    late = _first_point(models, every, robot)
+    late = first_point(models, every, robot)
     starts = _starts(keys, models)
     tangents = {f'{name}~{key}': (name, key) for name, start in starts.items() for key in start}
     for model in every:
@@ -111,7 +111,7 @@ def _priors(robot, keys, tolerance, stamps=0.0, weighed=WEIGHED):
     return priors, entries_of(keys), bounds, far
 
 
-def _first_point(models, every, robot):
+def first_point(models, every, robot):
     """
     Latency of tilt commands [s] at which the flights are linearised first; choose the modules.
 
