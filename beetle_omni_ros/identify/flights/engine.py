@@ -26,7 +26,6 @@ SAME = 0.04             # share of a typical difference between flights by which
 MOST = 8                # entries of a set
 PAIRED = 20             # entries whose pairs are all weighed; others follow from the best set
 FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
-NOTHING = 1e-9          # deviation of a discrepancy that is not there
 RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
 GROUPS = (0.0, 0.5, 2.0)    # [Hz] lower ends of the groups of bands of the test of constancy
 TURN = 1 / (2 * np.pi * GROUPS[-1])     # [s] one radian there: the phase of an answer of feedback
@@ -149,8 +148,6 @@ class Engine:
         etas = np.zeros((len(self.flights), len(self.names)))
         self._settle(theta, etas)
         self._learn(spectra := self._spectra(theta, etas))
-        self.power = [np.diagonal(s.noise[s.band], axis1=1, axis2=2).mean(axis=0)
-                      for s in spectra]
         self.filters = [self._filter(s, s.noise) for s in spectra]
         self.common = self._filter(max(spectra, key=lambda s: s.band[-1]), pooled(spectra))
         noise: list[np.ndarray] = []
@@ -176,8 +173,7 @@ class Engine:
                                                           strict=False)))
                 for name, value in starts.items():
                     theta[self.index[name]] = value
-        solution.plain = self._weighing(spectra, solution.banned, np.full(
-            len(self.names) - self.known, NOTHING))
+        solution.plain = self._weighing(spectra, solution.banned, 1e-9 * self.start[self.known:])
         return solution
 
     def _next(self, solution):
@@ -254,14 +250,10 @@ class Engine:
             if not np.array_equal(self._last.get(flight, (None, None))[0], at):
                 flight.settle(dict(zip(self.names, at, strict=False)))
 
-    def _wide(self):
-        """(K,) prior deviations of a fit in which every key may be far from the file."""
-        return np.hypot(self.narrow, np.concatenate([np.where(self.far, FREE, 1), np.zeros(
-            len(self.names) - self.known)]) * self.typical)
-
     def _learn(self, spectra, passes=8):
-        """Learn noise and discrepancy around a fit in which every key may be far."""
-        wide = self._wide()
+        """Learn noise and discrepancy around a fit in which every key may be far from the file."""
+        wide = np.hypot(self.narrow, np.concatenate([np.where(self.far, FREE, 1), np.zeros(
+            len(self.names) - self.known)]) * self.typical)
         for _ in range(passes):
             equations = normal(spectra, self.names, self.flight)
             # in units of the priors, so that the sum is well conditioned
@@ -330,11 +322,11 @@ class Engine:
         weight(tuple(k for k in best if self.entries[k].varying))
         posterior = judge.posterior(self.indices(best))
         return Solution(self.names, self.entries, gains, best, posterior, judge.equations, judge,
-                        spectra)
+                        judge, spectra)
 
     def _weighing(self, spectra, banned, generic):
         """Judge of sets; ``generic`` are the prior deviations of the discrepancy."""
-        equations, keys, copies, _ = self._split(spectra, banned, generic=generic)
+        equations, keys, copies, _ = self._split(spectra, banned, generic)
         wide = np.tile(self.typical[keys], copies)
         return self._judge(equations, form=wide, size=wide)
 
@@ -348,25 +340,20 @@ class Engine:
         power = np.diagonal(noise, axis1=1, axis2=2)[:spectrum.band[-1] + 1]
         return whitening(power, self.flights[0].period)
 
-    @staticmethod
-    def _bands_of_groups():
-        """(bands,) group of each band."""
-        return np.array([0, *np.searchsorted(GROUPS, EDGES[:-1], side='right') - 1])
-
-    def _split(self, spectra, banned, entry=None, generic=None):
+    def _split(self, spectra, banned, generic, entry=None):
         """
         Normal equations with separate values for the groups of bands, and their judge.
 
         Excluded entries have a value of typical size in each group always: what feedback makes of
         them must not be explained by others. ``entry`` has a deviation by the error of its form.
         """
-        bands = self._bands_of_groups()
+        # group of each band
+        bands = np.array([0, *np.searchsorted(GROUPS, EDGES[:-1], side='right') - 1])
         copies = int(bands.max()) + 1
         own = np.array(self.indices((entry,)) if entry is not None else [], dtype=int)
         free = np.array([*self.indices(tuple(banned)), *(self.late if banned else ())], dtype=int)
         keys = np.concatenate([own, free])
-        equations = normal(spectra, self.names, self.flight, keys, bands,
-                           self.narrow[self.known:] if generic is None else generic)
+        equations = normal(spectra, self.names, self.flight, keys, bands, generic)
         return equations, keys, copies, len(own)
 
     def _constancy(self, solution, banned):
@@ -379,7 +366,8 @@ class Engine:
         for k in solution.best:
             if not self.entries[k].in_loop:
                 continue
-            split, keys, copies, count = self._split(solution.spectra, banned, k)
+            split, keys, copies, count = self._split(
+                solution.spectra, banned, self.narrow[self.known:], k)
             size = np.maximum(self.typical[keys], np.abs(solution.theta[keys]))
             form = np.maximum(self.narrow[keys], FORM * np.abs(solution.theta[keys]))
             form[count:] = self.typical[keys[count:]]

@@ -374,10 +374,10 @@ class Solution:
     posterior: Posterior
     equations: Normal
     judge: Judge
+    plain: Judge
     spectra: list[Spectrum] = field(default_factory=list)
     unsteady: dict[int, float] = field(default_factory=dict)
     banned: dict[int, float] = field(default_factory=dict)
-    plain: Judge | None = None
 
     @property
     def theta(self) -> np.ndarray:

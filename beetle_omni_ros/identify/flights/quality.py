@@ -37,7 +37,6 @@ def fitted(engine: Engine, solution: Solution, k: int) -> np.ndarray:
     In a fit with it, tolerances and discrepancy may oppose each other, so that the fit without
     the share of the discrepancy leaves forces that the measurements do not show.
     """
-    assert solution.plain is not None
     theta = solution.plain.posterior(engine.indices(solution.best)).theta
     x = solution.plain.equations.of_flight(k, theta)[:len(engine.names)]
     x[:engine.known] += theta[:engine.known]
@@ -121,12 +120,6 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
         if total[0] - total[1] > 2 * log(1 / engine.alpha) else None
     before, after, floor = np.sqrt(total / count)
     return float(before), float(after), float(floor), closure
-
-
-def left_of(engine: Engine, solution: Solution) -> list[np.ndarray]:
-    """(B, F, C) whitened residual of each flight after the fit, without the discrepancy."""
-    return [found.residual + found.slopes @ fitted(engine, solution, k)
-            for k, found in enumerate(solution.spectra)]
 
 
 @dataclass(frozen=True)
@@ -246,7 +239,8 @@ def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
     """
     if solution.banned:
         return []
-    left = left_of(engine, solution)
+    left = [found.residual + found.slopes @ fitted(engine, solution, k)
+            for k, found in enumerate(solution.spectra)]
     rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
             line(solution.spectra, left, engine.channels)]
     return sorted(rows, key=lambda row: row.probability)

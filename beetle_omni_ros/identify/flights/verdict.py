@@ -40,7 +40,6 @@ from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
 LATE = 0.0, 0.012, 0.024     # [s] latencies of commands, as apart as a linear delay is accurate
-LATENESS = 'joint_command_latency.delay'
 BAG_GROUPS = {group: {'used': True, 'channels': [c for c in BagFlight.channels
                                                  if c.startswith(group)]}
               for group in ('force', 'torque', 'acceleration', 'rate', 'joint')}
@@ -90,7 +89,7 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
         priors |= {n: replace(priors[n], flight=0.0) for n in varying}
     engine = Engine(models, priors, entries, bounds, far, alpha, varying=varying,
                     kept=frozenset(kept), clock=IMU_LAG, curved=frozenset({*starts, *tangents}))
-    solution = engine.run({LATENESS: late})
+    solution = engine.run({'joint_command_latency.delay': late})
     for model in others:
         model.settle(dict(zip(engine.names[:engine.real], solution.theta, strict=False)))
     result = concluded(engine, solution, keys, others or models, BAG_GROUPS, starts=starts,
