@@ -15,6 +15,7 @@ from beetle_omni_ros.identify.flights.servo import (
     Windows,
 )
 from beetle_omni_ros.identify.flights.signals import Signals
+from beetle_omni_ros.identify.flights.verdict import first_point
 from beetle_omni_ros.identify.recording.bag import COMMAND, JOINTS
 from beetle_omni_ros.model.parameters import RobotParameters
 
@@ -60,7 +61,7 @@ SERVO = {'delay': 0.010, 'kp': JOINT.kp, 'kd': JOINT.kd, 'speed': JOINT.velocity
          'effort': JOINT.effort_limit, 'coulomb': 0.0, 'stiction': 0.0, 'bend': 0.0,
          'fading': 1e-3}
 FLOWN = [*(case[0] for case in CASES), *({'coulomb': 0.007, 'stiction': 0.010, 'fading': fading}
-         for fading in (0.03, 0.1)), {'effort': 0.05}]
+         for fading in (0.03, 0.1)), {'effort': 0.05}, {'delay': 0.036}]
 
 
 def servo(**changes):
@@ -189,3 +190,9 @@ def test_a_servo_sags_under_a_module_that_hangs_beside_its_axis(sets, base, mome
                                                         'mass_moment': base}})
     shown = simulate(robot, windows, np.zeros((1, k, 1, 4)), [0], [sets], 0.0)[0, -1, 0]
     assert shown == pytest.approx(moment * gravity / ROBOT.joints.kp, rel=1e-3)
+
+
+@pytest.mark.parametrize(('changes', 'late'), [({'effort': 0.05}, 0.0), ({'delay': 0.036}, 0.024)])
+def test_flights_are_first_linearised_at_the_latency_of_their_servos(changes, late):
+    made = model(flight(servo(**changes)))
+    assert first_point([made], [made], ROBOT) == late

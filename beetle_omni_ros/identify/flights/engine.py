@@ -140,14 +140,14 @@ class Engine:
         self.typical = np.concatenate([self.typical, np.zeros(size)])
         self.flight = np.concatenate([self.flight, np.zeros(size)])
 
-    def run(self) -> Solution:
-        """Relinearise, learn the noise and search, several times."""
+    def run(self, first: dict[str, float] | None = None) -> Solution:
+        """Relinearise, learn the noise and search, several times; ``first``: deviations there."""
         theta = np.zeros(len(self.names))
+        for name, value in (first or {}).items():
+            theta[self.index[name]] = value
         etas = np.zeros((len(self.flights), len(self.names)))
         self._settle(theta, etas)
         self._learn(spectra := self._spectra(theta, etas))
-        self.power = [np.diagonal(s.noise[s.band], axis1=1, axis2=2).mean(axis=0)
-                      for s in spectra]
         self.filters = [self._filter(s, s.noise) for s in spectra]
         self.common = self._filter(max(spectra, key=lambda s: s.band[-1]), pooled(spectra))
         noise: list[np.ndarray] = []
@@ -173,6 +173,7 @@ class Engine:
                                                           strict=False)))
                 for name, value in starts.items():
                     theta[self.index[name]] = value
+        solution.plain = self._weighing(spectra, solution.banned, 1e-9 * self.start[self.known:])
         return solution
 
     def _next(self, solution):
@@ -249,14 +250,10 @@ class Engine:
             if not np.array_equal(self._last.get(flight, (None, None))[0], at):
                 flight.settle(dict(zip(self.names, at, strict=False)))
 
-    def _wide(self):
-        """(K,) prior deviations of a fit in which every key may be far from the file."""
-        return np.hypot(self.narrow, np.concatenate([np.where(self.far, FREE, 1), np.zeros(
-            len(self.names) - self.known)]) * self.typical)
-
     def _learn(self, spectra, passes=8):
-        """Learn noise and discrepancy around a fit in which every key may be far."""
-        wide = self._wide()
+        """Learn noise and discrepancy around a fit in which every key may be far from the file."""
+        wide = np.hypot(self.narrow, np.concatenate([np.where(self.far, FREE, 1), np.zeros(
+            len(self.names) - self.known)]) * self.typical)
         for _ in range(passes):
             equations = normal(spectra, self.names, self.flight)
             # in units of the priors, so that the sum is well conditioned
@@ -283,9 +280,7 @@ class Engine:
         return [self.index[key] for k in chosen for key in self.entries[k].keys]
 
     def _search(self, spectra, banned):
-        equations, keys, copies, _ = self._split(spectra, banned)
-        wide = np.tile(self.typical[keys], copies)
-        judge = self._judge(equations, form=wide, size=wide)
+        judge = self._weighing(spectra, banned, self.narrow[self.known:])
         gains: dict[tuple[int, ...], float] = {}
         total = len(self.entries)
 
@@ -326,11 +321,14 @@ class Engine:
         weight(best)
         weight(tuple(k for k in best if self.entries[k].varying))
         posterior = judge.posterior(self.indices(best))
-        bands = self._bands_of_groups()
-        own = posterior.theta[self.known:].reshape(copies, len(keys))
-        unsteady = [(int(key), own[bands, j]) for j, key in enumerate(keys)]
-        return Solution(self.names, self.entries, gains, best, posterior, equations, judge,
-                        spectra, by_band=unsteady)
+        return Solution(self.names, self.entries, gains, best, posterior, judge.equations, judge,
+                        judge, spectra)
+
+    def _weighing(self, spectra, banned, generic):
+        """Judge of sets; ``generic`` are the prior deviations of the discrepancy."""
+        equations, keys, copies, _ = self._split(spectra, banned, generic)
+        wide = np.tile(self.typical[keys], copies)
+        return self._judge(equations, form=wide, size=wide)
 
     def gain(self, judge: Judge, one: tuple[int, ...], other: tuple[int, ...]) -> float:
         """Ln of the probability of one set of entries over that of another."""
@@ -342,25 +340,20 @@ class Engine:
         power = np.diagonal(noise, axis1=1, axis2=2)[:spectrum.band[-1] + 1]
         return whitening(power, self.flights[0].period)
 
-    @staticmethod
-    def _bands_of_groups():
-        """(bands,) group of each band."""
-        return np.array([0, *np.searchsorted(GROUPS, EDGES[:-1], side='right') - 1])
-
-    def _split(self, spectra, banned, entry=None):
+    def _split(self, spectra, banned, generic, entry=None):
         """
         Normal equations with separate values for the groups of bands, and their judge.
 
         Excluded entries have a value of typical size in each group always: what feedback makes of
         them must not be explained by others. ``entry`` has a deviation by the error of its form.
         """
-        bands = self._bands_of_groups()
+        # group of each band
+        bands = np.array([0, *np.searchsorted(GROUPS, EDGES[:-1], side='right') - 1])
         copies = int(bands.max()) + 1
         own = np.array(self.indices((entry,)) if entry is not None else [], dtype=int)
         free = np.array([*self.indices(tuple(banned)), *(self.late if banned else ())], dtype=int)
         keys = np.concatenate([own, free])
-        equations = normal(spectra, self.names, self.flight, keys, bands,
-                           self.narrow[self.known:])
+        equations = normal(spectra, self.names, self.flight, keys, bands, generic)
         return equations, keys, copies, len(own)
 
     def _constancy(self, solution, banned):
@@ -373,7 +366,8 @@ class Engine:
         for k in solution.best:
             if not self.entries[k].in_loop:
                 continue
-            split, keys, copies, count = self._split(solution.spectra, banned, k)
+            split, keys, copies, count = self._split(
+                solution.spectra, banned, self.narrow[self.known:], k)
             size = np.maximum(self.typical[keys], np.abs(solution.theta[keys]))
             form = np.maximum(self.narrow[keys], FORM * np.abs(solution.theta[keys]))
             form[count:] = self.typical[keys[count:]]

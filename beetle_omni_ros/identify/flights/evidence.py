@@ -363,7 +363,7 @@ class Solution:
         posterior: its evidence and estimate.
         unsteady: named entry -> gain of one value for each group of bands over one value [nat].
         banned: entry that was excluded for this -> its gain.
-        by_band: key of an excluded entry and its further value in each band (bands,).
+        plain: judge of a model without the generic discrepancy.
 
     """
 
@@ -374,10 +374,10 @@ class Solution:
     posterior: Posterior
     equations: Normal
     judge: Judge
+    plain: Judge
     spectra: list[Spectrum] = field(default_factory=list)
     unsteady: dict[int, float] = field(default_factory=dict)
     banned: dict[int, float] = field(default_factory=dict)
-    by_band: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
     @property
     def theta(self) -> np.ndarray:

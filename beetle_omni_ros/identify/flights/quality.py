@@ -31,9 +31,15 @@ NEAR = 12                                   # frequencies on each side that a li
 
 
 def fitted(engine: Engine, solution: Solution, k: int) -> np.ndarray:
-    """(K,) keys of flight k, without the discrepancy."""
-    x = solution.equations.of_flight(k, solution.theta)[:len(engine.names)]
-    x[:engine.known] += solution.theta[:engine.known]
+    """
+    (K,) keys of flight k, fitted without the discrepancy.
+
+    In a fit with it, tolerances and discrepancy may oppose each other, so that the fit without
+    the share of the discrepancy leaves forces that the measurements do not show.
+    """
+    theta = solution.plain.posterior(engine.indices(solution.best)).theta
+    x = solution.plain.equations.of_flight(k, theta)[:len(engine.names)]
+    x[:engine.known] += theta[:engine.known]
     return x
 
 
@@ -114,17 +120,6 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
         if total[0] - total[1] > 2 * log(1 / engine.alpha) else None
     before, after, floor = np.sqrt(total / count)
     return float(before), float(after), float(floor), closure
-
-
-def left_of(engine: Engine, solution: Solution) -> list[np.ndarray]:
-    """(B, F, C) whitened residual of each flight after the fit, without the discrepancy."""
-    rows = []
-    for k, found in enumerate(solution.spectra):
-        rest = found.residual + found.slopes @ fitted(engine, solution, k)
-        for key, values in solution.by_band:
-            rest += found.slopes[:, :, :, key] * values[found.band][None, :, None]
-        rows.append(rest)
-    return rows
 
 
 @dataclass(frozen=True)
@@ -213,9 +208,13 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
 
     """
     own = spectra[0].groups[0]
-    count = min(rest.shape[1] for rest in left)
-    first = int(np.ceil(SLOWEST / spectra[0].step))
-    rest = np.concatenate([rest[:, first:count][..., own] for rest in left])**2
+    # blocks of flights differ in length, and so do their frequencies
+    step = max(found.step for found in spectra)
+    last = min((rest.shape[1] - 1) * found.step
+               for found, rest in zip(spectra, left, strict=True))
+    frequency = step * np.arange(int(np.ceil(SLOWEST / step)), int(last / step) + 1)
+    rest = np.concatenate([rest[:, np.rint(frequency / found.step).astype(int)][..., own]
+                           for found, rest in zip(spectra, left, strict=True)])**2
     blocks, power = len(rest), rest.mean(axis=0)
     # a slope of the spectrum is no line, so the larger of both sides counts
     places = np.arange(NEAR, len(power) - NEAR)
@@ -226,10 +225,9 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
     sides = NEAR - 1
     chance = float(f_law.sf(ratio[k, c], blocks, blocks * sides)) * ratio.size
     order = np.argsort(-ratio[k])
-    frequency = (places[k] + first) * spectra[0].step
     return Unexplained('line', min(chance, 1.0), float(blocks * (
         ratio[k, c] - 1 - np.log(ratio[k, c])) / 2), tuple(channels[own[i]] for i in order[:2]),
-        float(frequency))
+        float(frequency[places[k]]))
 
 
 def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
@@ -241,7 +239,8 @@ def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
     """
     if solution.banned:
         return []
-    left = left_of(engine, solution)
+    left = [found.residual + found.slopes @ fitted(engine, solution, k)
+            for k, found in enumerate(solution.spectra)]
     rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
             line(solution.spectra, left, engine.channels)]
     return sorted(rows, key=lambda row: row.probability)

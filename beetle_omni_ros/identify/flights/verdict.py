@@ -39,7 +39,7 @@ from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
-LATE = 0.012, 0.024          # [s] latencies at which the tilting modules are decided, too
+LATE = 0.0, 0.012, 0.024     # [s] latencies of commands, as apart as a linear delay is accurate
 BAG_GROUPS = {group: {'used': True, 'channels': [c for c in BagFlight.channels
                                                  if c.startswith(group)]}
               for group in ('force', 'torque', 'acceleration', 'rate', 'joint')}
@@ -59,6 +59,7 @@ LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
 SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
 Then = Callable[[Engine, Solution, dict, Starts | None, list], dict]   # adds; last: judges
 
+
 def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: RobotParameters,
            p: GapParameters, alpha: float = ALPHA, then: Then | None = None) -> dict:
     """Results of checked flights of bags; ``judging`` is held out. ``then`` may add to them."""
@@ -66,16 +67,15 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     body = BodyModel(robot, keys, tilting_modules(robot))
     every = [BagFlight(flight, robot, body, keys, p) for flight in [*flights, *judging]]
     models, others = every[:len(flights)], every[len(flights):]
-    if robot.multibody is not None:
-        _choose_modules(models, every)
+    late = first_point(models, every, robot)
     starts = {name: own for name, own in _starts(keys, models).items()
               if name.partition('@')[0] not in p.without}
     tangents = {f'{name}~{key}': (name, key) for name, start in starts.items() for key in start}
     for model in every:
         model.starts, model.tangents = starts, tangents
     coarse = float(np.median([m.signals.position_noise for m in models])) > p.coarse_noise
-    late, kept = _delays(robot, p, coarse)
-    tolerance = tolerances(p) | late
+    delays, kept = _delays(robot, p, coarse)
+    tolerance = tolerances(p) | delays
     priors, entries, bounds, far = _priors(robot, {
         n: key for n, key in keys.items() if key.effect in CATALOGUE and not key.form
         and key.effect not in {*LIMITS, *p.without}}, tolerance)
@@ -92,7 +92,7 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
         priors |= {n: replace(priors[n], flight=0.0) for n in varying}
     engine = Engine(models, priors, entries, bounds, far, alpha, varying=varying,
                     kept=frozenset(kept), clock=IMU_LAG, curved=frozenset({*starts, *tangents}))
-    solution = engine.run()
+    solution = engine.run({'joint_command_latency.delay': late})
     for model in others:
         model.settle(dict(zip(engine.names[:engine.real], solution.theta, strict=False)))
     result = concluded(engine, solution, keys, others or models, BAG_GROUPS, starts=starts,
@@ -113,18 +113,26 @@ def _priors(robot, keys, tolerance, stamps=0.0, weighed=WEIGHED):
     return priors, entries_of(keys), bounds, far
 
 
-def _choose_modules(models, every):
-    """Use the file's tilting modules if the servos agree better with them, at any latency."""
-    costs = []
-    for share in (0.0, 1.0):
+def first_point(models, every, robot):
+    """
+    Latency of tilt commands [s] at which the flights are linearised first; choose the modules.
+
+    The file's tilting modules are used if servos and forces agree better with them, at any
+    latency. From no latency, a linear fit takes a large one for servos with less stiffness.
+    """
+    costs = {}
+    for share in (0.0, 1.0) if robot.multibody is not None else (0.0,):
         for model in models:
             model.modules = share
             model.settle({})
-        costs.append(min(sum(float(np.log(r.var(axis=0)).sum()) for model in models
-                             for r in model.residual(late, 'BJ').values())
-                         for late in ({}, *({'command_latency.delay': d} for d in LATE))))
+        for late in LATE:
+            costs[share, late] = sum(
+                float(np.log(r.var(axis=0)).sum()) for model in models
+                for r in model.residual({'command_latency.delay': late}, 'BJ').values())
+    share, late = min(costs, key=lambda point: costs[point])
     for model in every:
-        model.modules = float(np.argmin(costs))
+        model.modules = share
+    return late
 
 
 def _starts(keys, models):
