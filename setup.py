@@ -26,7 +26,8 @@ def version():
 def shared(*folders):
     """List the files below ``folders`` as data files under ``share/beetle_omni_ros``."""
     files = [path for folder in folders for path in sorted(Path(folder).rglob('*'))
-             if path.is_file() and path.suffix != '.pyc' and not path.name.startswith('.')]
+             if path.is_file() and path.suffix != '.pyc' and not path.name.startswith('.')
+             and 'build' not in path.parts]
     parents = sorted({path.parent for path in files})
     return [(f'share/{PACKAGE}/{parent.as_posix()}',
              [path.as_posix() for path in files if path.parent == parent])
@@ -91,7 +92,7 @@ GYM = [
     'gymnasium>=1.0,<2',
 ]
 
-# show/notebook.py alone: tables, and what plotly needs to draw in a cell.
+# show/report.py alone: tables, and what plotly needs to draw in a cell.
 NOTEBOOK = [
     'nbformat>=5',
     'pandas>=2,<4',
@@ -138,11 +139,11 @@ setup(
     license='BSD-3-Clause',
     python_requires='>=3.10,<3.14',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={'': ['*.c', '*.css', '*.h', '*.html', '*.md']},
+    package_data={'': ['*.c', '*.css', '*.h', '*.html', '*.md', '*.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
-        *shared('params', 'policies', 'launch', 'description', 'viewers'),
+        *shared('params', 'policies', 'launch', 'description', 'viewers', 'firmware'),
     ],
     zip_safe=False,
     install_requires=REQUIREMENTS,

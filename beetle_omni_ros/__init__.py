@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from beetle_omni_ros.flight.loop import FlightLoop
     from beetle_omni_ros.model.parameters import RobotParameters
-    from beetle_omni_ros.show.notebook import NotebookLog
+    from beetle_omni_ros.show.report import NotebookLog
 
 __version__ = '0.1.0'
 __all__ = ['evaluate', 'find_gap', 'read_run', 'robot', 'simulate', 'simulation', 'trajectory']
@@ -70,7 +70,7 @@ def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
 
     """
     from beetle_omni_ros.flight.evaluate import fly
-    from beetle_omni_ros.show.notebook import NotebookLog
+    from beetle_omni_ros.show.report import NotebookLog
     believed, flown = _robot(robot), _task(task, seed)
     given = robot is None or robot is believed
     log = fly(_reference(controller), flown, robot=believed,
@@ -98,7 +98,7 @@ def simulation(controller: str | Callable = 'nmpc', *,
 
     """
     from beetle_omni_ros.flight.evaluate import prepared
-    from beetle_omni_ros.show.notebook import NotebookLog
+    from beetle_omni_ros.show.report import NotebookLog
     believed = _robot(robot)
     loop = prepared(_reference(controller), robot=believed, conditions=conditions, seed=seed,
                     plant=believed if plant is None else _robot(plant))
@@ -141,7 +141,7 @@ def read_run(path: str | Path) -> NotebookLog:
     ParameterError of one line refuses a file that is no bag, and lists the runs in a folder.
     """
     from beetle_omni_ros.bags.bag import read_bag
-    from beetle_omni_ros.show.notebook import NotebookLog
+    from beetle_omni_ros.show.report import NotebookLog
     return NotebookLog.of(read_bag(path))
 
 

@@ -9,73 +9,48 @@ from typing import Annotated
 
 from typer import Argument, echo, Option
 
+from beetle_omni_ros import options
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, OWNER
-from beetle_omni_ros.identify_commands import identify
-from beetle_omni_ros.improve import improve
+from beetle_omni_ros.identify_commands import gap, identify, improve
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.options import (
-    Commands,
-    ComponentOption,
-    CONDITIONS,
-    ConditionsOption,
-    ControllerOption,
-    DomainOption,
-    FAILED,
-    FaultsOption,
-    FullOption,
-    JobsOption,
-    JsonOption,
-    KNOWN,
-    NamespaceOption,
-    NmpcOption,
-    one_of,
-    OutputOption,
-    PageOption,
-    PlantOption,
-    PolicyOption,
-    RobotOption,
-    SeedOption,
-    several,
-    TaskOption,
-    TheRobotOption,
-    whole,
-    writable,
-)
 
-app = Commands(help='Fly, evaluate and report on the tiltable quadrotor; --version: its version.')
+app = options.Commands(
+    help='Fly, evaluate and report on the tiltable quadrotor; --version: its version.')
 
 
 @app.command()
-def fly(controller: ControllerOption = DEFAULT,
-        task: TaskOption = 'waypoints',
+def fly(controller: options.ControllerOption = DEFAULT,
+        task: options.TaskOption = 'waypoints',
         bag: Annotated[Path | None, Option(metavar='DIR', help=(
             'New folder for the recorded bag. Default: runs_out/fly_DATE.'))] = None,
-        conditions: ConditionsOption = 'nominal',
-        seed: SeedOption = 0,
-        actuators: Annotated[str | None, Option(callback=one_of, metavar='emulated|direct', help=(
+        conditions: options.ConditionsOption = 'nominal',
+        seed: options.SeedOption = 0,
+        actuators: Annotated[str | None, Option(
+            callback=options.one_of, metavar='emulated|direct', help=(
             'emulated (default): commands go through joint_bridge_node, rotor_bridge_node, serial '
             'ports and emulated devices; direct: they go straight to the simulated '
             'plant.'))] = None,
-        clock: Annotated[str, Option(callback=one_of, metavar='auto|system|simulated', help=(
+        clock: Annotated[str, Option(
+            callback=options.one_of, metavar='auto|system|simulated', help=(
             'system: real time; simulated: simulated time on /clock, which waits for late nodes, '
             'with direct actuators; auto: simulated if this computer is too slow for real time, '
             'measured before the start.'))] = 'auto',
-        robot: RobotOption = None,
-        plant: PlantOption = None,
-        nmpc: NmpcOption = None,
-        policy: PolicyOption = None,
+        robot: options.RobotOption = None,
+        plant: options.PlantOption = None,
+        nmpc: options.NmpcOption = None,
+        policy: options.PolicyOption = None,
         standby: Annotated[bool, Option('--standby/--alone', help=(
             'Run the other controllers on standby, to be selected in flight, or only the active '
             'controller.'))] = True,
-        faults: FaultsOption = None,
-        components: ComponentOption = None,
-        domain_id: DomainOption = None,
+        faults: options.FaultsOption = None,
+        components: options.ComponentOption = None,
+        domain_id: options.DomainOption = None,
         view: Annotated[bool, Option('--view', help=(
             'Show the flight in the browser, as beetle_omni view does, and write a page that '
             'plays it into the folder of the bag.'))] = False,
-        full: FullOption = False,
-        json_path: JsonOption = None):
+        full: options.FullOption = False,
+        json_path: options.JsonOption = None):
     """
     Fly the simulated robot with the whole ROS graph in real time.
 
@@ -92,29 +67,30 @@ def fly(controller: ControllerOption = DEFAULT,
 
 @app.command()
 def evaluate(controllers: Annotated[str, Option(
-                 '--controllers', '--controller', callback=several, metavar='NAME,...', help=(
-                     f'Controllers to fly one after the other: {KNOWN}.'))] = DEFAULT,
-             task: TaskOption = 'random100',
-             conditions: ConditionsOption = 'nominal',
-             seed: SeedOption = 0,
-             robot: RobotOption = None,
-             plant: PlantOption = None,
-             nmpc: NmpcOption = None,
-             policy: PolicyOption = None,
+                 '--controllers', '--controller', callback=options.several,
+                 metavar='NAME,...', help=(
+                     f'Controllers to fly one after the other: {options.KNOWN}.'))] = DEFAULT,
+             task: options.TaskOption = 'random100',
+             conditions: options.ConditionsOption = 'nominal',
+             seed: options.SeedOption = 0,
+             robot: options.RobotOption = None,
+             plant: options.PlantOption = None,
+             nmpc: options.NmpcOption = None,
+             policy: options.PolicyOption = None,
              without: Annotated[str, Option(metavar='LAYER,...', help=(
                  'Layers of the guidance that are off: unwinding, routing, trimming, or '
                  'all.'))] = '',
              bag: Annotated[Path | None, Option(metavar='DIR', help=(
                  'New folder for the bag; with several controllers it contains one bag for '
                  'each.'))] = None,
-             faults: FaultsOption = None,
+             faults: options.FaultsOption = None,
              actuators: Annotated[str, Option(
-                 callback=one_of, metavar='direct|emulated', help=(
+                 callback=options.one_of, metavar='direct|emulated', help=(
                      'direct: commands go straight to the simulated plant; emulated: through '
                      'drivers, serial ports and emulated devices, in real time.'))] = 'direct',
-             components: ComponentOption = None,
-             full: FullOption = False,
-             json_path: JsonOption = None):
+             components: options.ComponentOption = None,
+             full: options.FullOption = False,
+             json_path: options.JsonOption = None):
     """
     Fly a task in one process, deterministic and without a clock.
 
@@ -125,43 +101,45 @@ def evaluate(controllers: Annotated[str, Option(
                            for name in controllers):
         raise ParameterError(f'--without {without}: no controller with guidance among '
                              f"{', '.join(controllers)}")
-    options = {name: ControllerOptions(without=without) for name in controllers}
+    given = {name: ControllerOptions(without=without) for name in controllers}
     for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
-        name = OWNER[option]
+        name = OWNER[key]
         if file and name not in controllers:
             raise ParameterError(f"{option} {file}: for the controller '{name}', which is not "
                                  f"among {', '.join(controllers)}")
         if file:
-            options[name] = replace(options[name], **{key: file})
+            given[name] = replace(given[name], **{key: file})
     from beetle_omni_ros.bags.metrics import failed
     from beetle_omni_ros.flight.evaluate import run_evaluate
     results = run_evaluate(controllers=controllers, task=task, conditions=conditions, robot=robot,
                            plant=plant, seed=seed, bag=bag, json_path=json_path,
                            faults=faults, actuators=actuators, components=components or (),
-                           options=options, full=full)
+                           options=given, full=full)
     if bag is None:
         echo('next:  the same with --bag DIR records the flight; with --full it prints everything')
-    return FAILED if any(map(failed, results.values())) else 0
+    return options.FAILED if any(map(failed, results.values())) else 0
 
 
 @app.command()
 def compare(controllers: Annotated[str | None, Option(
-                '--controllers', '--controller', callback=several, metavar='NAME,...', help=(
-                    f"Controllers: {KNOWN}. Default: {', '.join(registry.COMPARED)}; a missing "
-                    'policy is left out.'))] = None,
-            tasks: Annotated[str | None, Option(callback=several, metavar='TASK,...', help=(
+                '--controllers', '--controller', callback=options.several,
+                metavar='NAME,...', help=(
+                    f"Controllers: {options.KNOWN}. Default: {', '.join(registry.COMPARED)}; a "
+                    'missing policy is left out.'))] = None,
+            tasks: Annotated[str | None, Option(
+                callback=options.several, metavar='TASK,...', help=(
                 'Names or pose files. Default: those of the publication.'))] = None,
-            conditions: Annotated[str, Option(callback=several, metavar='NAME,...', help=(
-                'nominal, published, or both.'))] = ','.join(CONDITIONS),
-            seeds: Annotated[str | None, Option(callback=whole, metavar='N,...', help=(
+            conditions: Annotated[str, Option(callback=options.several, metavar='NAME,...', help=(
+                'nominal, published, or both.'))] = ','.join(options.CONDITIONS),
+            seeds: Annotated[str | None, Option(callback=options.whole, metavar='N,...', help=(
                 'Default: 0 to 9; 0 to 5 above 50 s, 0 to 2 above 300 s.'))] = None,
-            policy: PolicyOption = None,
-            plant: PlantOption = None,
-            jobs: JobsOption = None,
-            output: OutputOption = Path('comparison'),
+            policy: options.PolicyOption = None,
+            plant: options.PlantOption = None,
+            jobs: options.JobsOption = None,
+            output: options.OutputOption = Path('comparison'),
             cache: Annotated[Path | None, Option(metavar='DIR', help=(
                 'Cache of finished flights. Default: .flights in the output.'))] = None,
-            json_path: JsonOption = None):
+            json_path: options.JsonOption = None):
     """
     Fly every experiment with several controllers; write one page.
 
@@ -176,19 +154,19 @@ def compare(controllers: Annotated[str | None, Option(
 @app.command()
 def faults(faults: Annotated[Path | None, Option(metavar='FILE', help=(
                'List of faults. Default: the shipped params/faults.yaml.'))] = None,
-           only: Annotated[str | None, Option(callback=several, metavar='NAME,...', help=(
+           only: Annotated[str | None, Option(callback=options.several, metavar='NAME,...', help=(
                'Faults of the list. Default: all.'))] = None,
            starts: Annotated[str | None, Option(
-               '--from', callback=several, metavar='NAME,...', help=(
+               '--from', callback=options.several, metavar='NAME,...', help=(
                    'Flight before the fault: hover, moving, upside_down, or random (a random time '
                    'of random100). Default: the first three.'))] = None,
            seeds: Annotated[int, Option(metavar='N', min=1, help=(
                'Flights of each fault from each start.'))] = 1,
            seed: Annotated[int, Option(metavar='N', min=0, max=2**31 - 1, help=(
                'Seed of the first flight; it grows by one with each further flight.'))] = 0,
-           conditions: ConditionsOption = 'nominal',
-           controller: ControllerOption = DEFAULT,
-           plant: PlantOption = None,
+           conditions: options.ConditionsOption = 'nominal',
+           controller: options.ControllerOption = DEFAULT,
+           plant: options.PlantOption = None,
            landings: Annotated[int, Option(metavar='N', min=0, help=(
                'Fly N landings from random attitudes instead of the list.'))] = 0,
            without_mocap: Annotated[bool, Option('--without-mocap', help=(
@@ -196,11 +174,11 @@ def faults(faults: Annotated[Path | None, Option(metavar='FILE', help=(
            healthy: Annotated[float, Option(metavar='HOURS', min=0.0, max=1000.0, help=(
                'Fly for this time without a fault under each of nominal, published and effects, '
                'and count false alarms, instead of the list.'))] = 0.0,
-           jobs: JobsOption = None,
+           jobs: options.JobsOption = None,
            bags: Annotated[bool, Option('--bags', help=(
                'Record each flight in --output.'))] = False,
-           output: OutputOption = None,
-           json_path: JsonOption = None):
+           output: options.OutputOption = None,
+           json_path: options.JsonOption = None):
     """
     Inject a list of faults into flights, on all cores.
 
@@ -219,10 +197,11 @@ def faults(faults: Annotated[Path | None, Option(metavar='FILE', help=(
 def report(paths: Annotated[list[Path], Argument(metavar='RUN...', help=(
                'Recorded bags: rosbag2 folders, or one of their files.'))],
            output: Annotated[Path, Option(
-               '--output', '-o', callback=writable, metavar='FILE', help='The page to write.')]
+               '--output', '-o', callback=options.writable, metavar='FILE',
+               help='The page to write.')]
            = Path('report.html'),
-           full: FullOption = False,
-           json_path: JsonOption = None):
+           full: options.FullOption = False,
+           json_path: options.JsonOption = None):
     """
     Write one HTML page with metrics and plots of one or more runs.
 
@@ -236,8 +215,8 @@ def report(paths: Annotated[list[Path], Argument(metavar='RUN...', help=(
 @app.command()
 def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
              'Recorded bags, shown together; without RUN: a running graph.'))] = None,
-         namespace: NamespaceOption = '',
-         domain_id: DomainOption = None,
+         namespace: options.NamespaceOption = '',
+         domain_id: options.DomainOption = None,
          host: Annotated[str, Option(metavar='ADDRESS', help=(
              'Address at which the page is served; 0.0.0.0: to the whole network.'))]
          = '127.0.0.1',
@@ -256,7 +235,7 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
     page = {'host': host, 'port': port}
     graph = {'namespace': namespace, 'domain_id': domain_id}
     if not runs:
-        from beetle_omni_ros.ros.operator import run_live
+        from beetle_omni_ros.ros.listeners import run_live
         run_live(**graph, **page)
         return
     for name, value in graph.items():
@@ -271,47 +250,8 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
     run_view(runs, **page)
 
 
-@app.command()
-def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
-            'Recorded flights: bags, or with --format tables; or logs of the joints (CSV, or bags '
-            'with only joint_states and command).'))],
-        holdout: Annotated[list[Path], Option(metavar='RUN...', help=(
-            'Flights for validation only. Default: the last of three bags or more.'))] = (),
-        robot: TheRobotOption = None,
-        apply: Annotated[Path | None, Option(callback=writable, metavar='FILE', help=(
-            'Write a robot file with the named effects.'))] = None,
-        page: PageOption = None,
-        parameters: Annotated[Path | None, Option('--gap', metavar='FILE', help=(
-            'File with changes to params/gap.yaml.'))] = None,
-        fix: Annotated[bool, Option('--fix', help=(
-            'Correct damaged recordings if the correction is certain; the bags stay '
-            'unchanged.'))] = False,
-        tolerances: Annotated[bool, Option('--tolerances', help=(
-            "With --apply: also write this robot's own mass, inertia, gains, lags and rotor "
-            'positions, as fitted within tolerance.'))] = False,
-        form: Annotated[str | None, Option('--format', metavar='NAME|FILE', help=(
-            'Flights are tables (CSV, .gz) with the columns of this format: nanobench, '
-            'crazypad_motor, or a YAML file.'))] = None,
-        alpha: Annotated[float, Option(metavar='P', help=(
-            'Accepted probability of a false alarm.'))] = 0.05,
-        next_task: Annotated[Path | None, Option(
-            '--next', callback=writable, metavar='FILE', help=(
-                'Write a task (YAML) that decides between the candidates, for fly and '
-                'evaluate.'))] = None,
-        json_path: JsonOption = None):
-    """
-    Identify and add effects that the model lacks from flights.
-
-    Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
-    """
-    from beetle_omni_ros.flight.experiment import Experiments
-    from beetle_omni_ros.identify.flights.command import run_gap
-    return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
-                   tolerances=tolerances, form=form, alpha=alpha, next_task=next_task,
-                   experiments=Experiments)
-
-
-app.command()(improve)
+for command in (gap, improve):
+    app.command()(command)
 
 
 @app.command()
@@ -334,14 +274,14 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
               'Test all parts with tiny sizes.'))] = False,
           stop_after: Annotated[float | None, Option(min=0, metavar='SECONDS', help=(
               'End the training after this time.'))] = None,
-          robot: TheRobotOption = None,
-          json_path: JsonOption = None):
+          robot: options.TheRobotOption = None,
+          json_path: options.JsonOption = None):
     """
     Train a policy and export it to ONNX.
 
     Needs the extra 'train' and a GPU.
     """
-    from beetle_omni_ros.train.command import parse_changes, run_train
+    from beetle_omni_ros.train.runner import parse_changes, run_train
     run_train(output=output, config=config, robot=robot, device=device, resume=resume,
               teacher=teacher, changes=parse_changes(changes, seed=seed),
               smoke=smoke, stop_after=stop_after, json_path=json_path)
@@ -357,16 +297,16 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
           motor_board: Annotated[Path | None, Option(metavar='FILE', help=(
               'Settings of the motor board. Default: the shipped '
               'params/motor_board.yaml.'))] = None,
-          robot: TheRobotOption = None,
+          robot: options.TheRobotOption = None,
           seconds: Annotated[float, Option(metavar='S', min=1, max=600, help=(
               'Time to receive from the motor board, and from ROS.'))] = 3.0,
           skip: Annotated[list[str], Option(metavar='servos|board|ros', help=(
               'Skip a part; may be repeated.'))] = (),
-          namespace: NamespaceOption = '',
+          namespace: options.NamespaceOption = '',
           timing: Annotated[bool, Option('--timing', help=(
               'Only measure the cycles of estimator and controllers on this computer; 1 min.'))
               ] = False,
-          json_path: JsonOption = None):
+          json_path: options.JsonOption = None):
     """
     Check ports, devices and clocks of the real robot before flight.
 
@@ -374,7 +314,7 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
     Example: beetle_omni check --servo-port /dev/ttyUSB0 --skip board
     """
     def listen(duration):
-        from beetle_omni_ros.ros.operator import listen as listen_to_ros
+        from beetle_omni_ros.ros.listeners import listen as listen_to_ros
         return listen_to_ros(duration, namespace)
 
     from beetle_omni_ros.drivers.check import run_check
@@ -388,13 +328,13 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
 
 @app.command()
 def drive(source: Annotated[str, Argument(
-              callback=one_of, metavar='keyboard|joystick|terminal', help=(
+              callback=options.one_of, metavar='keyboard|joystick|terminal', help=(
               'Input: keys of this terminal, the topic joy, or typed commands.'))] = 'keyboard',
           parameters: Annotated[Path | None, Option('--params', metavar='FILE', help=(
               'Limits, axes, buttons and named poses. Default: the shipped '
               'params/drive.yaml.'))] = None,
-          robot: RobotOption = None,
-          domain_id: DomainOption = None):
+          robot: options.RobotOption = None,
+          domain_id: options.DomainOption = None):
     """
     Drive a running graph by hand, within all supervisor checks.
 

@@ -86,11 +86,11 @@ PlantOption = Annotated[Path | None, Option(metavar='FILE', help=(
     'Default: as --robot.'))]
 NmpcOption = Annotated[Path | None, Option(
     exists=True, dir_okay=False, metavar='FILE', help=(
-        f"Parameters of the controller '{registry.OWNER['--nmpc']}'. Default: the shipped "
+        f"Parameters of the controller '{registry.OWNER['parameters']}'. Default: the shipped "
         'params/nmpc.yaml.'))]
 PolicyOption = Annotated[Path | None, Option(
     exists=True, dir_okay=False, metavar='FILE', help=(
-        f"Policy (ONNX) for the controller '{registry.OWNER['--policy']}'. Default: the shipped "
+        f"Policy (ONNX) for the controller '{registry.OWNER['policy']}'. Default: the shipped "
         'one.'))]
 DomainOption = Annotated[int | None, Option(
     metavar='N', min=0, max=101, help='ROS domain. Default: ROS_DOMAIN_ID; of fly, a free one.')]

@@ -27,11 +27,10 @@ import torch
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.train.batch import PERIOD
-from beetle_omni_ros.train.command import choose_device
 from beetle_omni_ros.train.environment import SUBSTEPS, TiltableQuadrotorEnv
+from beetle_omni_ros.train.model import Physics
 from beetle_omni_ros.train.parameters import TrainParameters
-from beetle_omni_ros.train.physics import Physics
-from beetle_omni_ros.train.runner import Runner
+from beetle_omni_ros.train.runner import choose_device, Runner
 
 TARGET = 10e6                  # environment steps a second, on a GPU
 GPU_ROBOTS, CPU_ROBOTS = '4096,16384', '64,1024'

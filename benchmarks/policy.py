@@ -38,17 +38,17 @@ from beetle_omni_ros.model.schema import ParameterError
 TARGETS = {'median': 0.1, 'p99': 0.2}   # [ms] of inference
 
 
-class TimedPolicy(PolicyController):
-    """A policy with the CPU ``times`` [s] of its network within its step."""
+class TimedNetwork:
+    """The network of a policy, with the CPU ``times`` [s] of its calls."""
 
-    def __init__(self, robot, parameters):
-        super().__init__(robot, parameters)
+    def __init__(self, network):
+        self._network = network
         self.times: list[float] = []
-        self._infer, self.network = self.network, self._timed
 
-    def _timed(self, observation):
+    def __call__(self, observation):
+        """Action of an observation."""
         began = thread_time()
-        action = self._infer(observation)
+        action = self._network(observation)
         self.times.append(thread_time() - began)
         return action
 
@@ -61,10 +61,11 @@ def compute_summary(times: Sequence[float], period: float) -> dict[str, float | 
             'deadline_misses': int(np.sum(used > 1e3 * period)), 'count': len(times)}
 
 
-def measure(parameters: PolicyParameters, poses: int, seed: int) -> tuple[dict, TimedPolicy]:
+def measure(parameters: PolicyParameters, poses: int, seed: int) -> tuple[dict, PolicyController]:
     """Fly; return the times of the steps by controller, and the policy."""
     robot, recorder = RobotParameters.load(), LogRecorder()
-    policy = TimedPolicy(robot, parameters)
+    policy = PolicyController(robot, parameters)
+    policy.network = TimedNetwork(policy.network)
     flight = FlightLoop(robot, robot, {'nmpc': NmpcController(robot), 'rl': policy}, recorder,
                         seed=seed)
     flight.fly(make_task(f'random{poses}', seed))
@@ -97,7 +98,7 @@ def main():
     table = Table('', 'steps', 'median', 'p99', 'max', title=f'{policy.contract.name}, '
                   f'{policy.contract.observation_size} inputs, {parameters.policy}; '
                   f'{given.poses} random poses, seed {given.seed}: CPU [ms]')
-    inference = compute_summary(policy.times, policy.period)
+    inference = compute_summary(policy.network.times, policy.period)
     results = {**{f'{name}: step': numbers for name, numbers in steps.items()},
                'rl: inference': inference}
     for name, numbers in results.items():
@@ -105,7 +106,7 @@ def main():
             f'{numbers[key]:.3f}' for key in ('median', 'p99', 'max')))
     Console(width=120).print(table)
     poses = [compute_summary(list(part), policy.period)
-             for part in np.array_split(policy.times, given.poses)]
+             for part in np.array_split(policy.network.times, given.poses)]
     quietest = min(poses, key=lambda numbers: numbers['p99'])
     met = within(inference)
     print('target of inference: '

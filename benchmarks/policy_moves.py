@@ -61,34 +61,25 @@ class Batched:
     def __init__(self, path: Path):
         graph = onnx.load(path)
         self._single = session(graph.SerializeToString())
-        self._histories = {}
         for value in (*graph.graph.input, *graph.graph.output):
             value.type.tensor_type.shape.dim[0].dim_param = 'robots'
         del graph.graph.value_info[:]
         self._many = session(graph.SerializeToString())
         size = self._single.get_inputs()[0].shape[1]
         try:
-            self._call(self._many, np.zeros((2, size), np.float32), 'tried')
+            self._call(self._many, np.zeros((2, size), np.float32))
         except Exception:       # onnxruntime's have no common base class
             self._many = None
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """(N, 8) actions of (N, 33 or 39) observations."""
         if self._many:
-            return self._call(self._many, observations, 'all')
-        return np.vstack([self._call(self._single, row[None], k)
-                          for k, row in enumerate(observations)])
+            return self._call(self._many, observations)
+        return np.vstack([self._call(self._single, row[None]) for row in observations])
 
-    def _call(self, session, observations, robots):
-        """Act, and keep the histories of these robots."""
-        inputs = {'observation': observations}
-        for tensor in session.get_inputs()[1:]:
-            inputs[tensor.name] = self._histories.get(robots, np.zeros(
-                (len(observations), tensor.shape[1]), np.float32))
-        action, *following = session.run(None, inputs)
-        if following:
-            self._histories[robots] = following[0]
-        return action
+    @staticmethod
+    def _call(session, observations):
+        return session.run(None, {'observation': observations})[0]
 
 
 def conditions(name: str, random: RandomParameters) -> RandomParameters:
@@ -100,8 +91,7 @@ def conditions(name: str, random: RandomParameters) -> RandomParameters:
             if isinstance(getattr(random, entry.name), float)}
     return replace(random, **{**zero, 'push_period': 1.0, 'thrust_sag': random.thrust_sag},
                    command_latency=[0.01, 0.01], velocity_latency=[0.0, 0.0],
-                   tilt_latency=[0.01, 0.01], actuator_spread=[0.0, 0.0],
-                   friction_scale=[1.0, 1.0])
+                   tilt_latency=[0.01, 0.01], actuator_spread=[0.0, 0.0])
 
 
 def environment(robots: int, name: str, memory: bool, robot: RobotParameters):
@@ -109,7 +99,7 @@ def environment(robots: int, name: str, memory: bool, robot: RobotParameters):
     p = TrainParameters.load()
     still = {entry.name: 0.0 for entry in fields(StartParameters)}
     env = TiltableQuadrotorEnv(replace(
-        p, memory=memory, ppo=replace(p.ppo, robots=robots), network=replace(p.network, history=0),
+        p, memory=memory, ppo=replace(p.ppo, robots=robots),
         episode=replace(p.episode, duration=1e6, hold_targets=0.0, replay_share=0.0,
                         target_time=np.array([1e3, 1e3]), position_limit=99.0),
         start=StartParameters(**{**still, 'hold': 1.0}),

@@ -43,8 +43,6 @@ FILES = {
     'rl_bare.yaml': ('control.policy:PolicyParameters', 'The policy without guidance.'),
     'rl_any.yaml': ('control.policy:PolicyParameters',
                        'The policy with the estimated disturbance as input.'),
-    'rl_late.yaml': ('control.policy:PolicyParameters',
-                     'The policy that observes its last steps.'),
     'rl_published.yaml': ('control.policy:PolicyParameters',
                           'The policy of train_published.yaml.'),
     'hover.yaml': ('control.hover:HoverParameters', 'The hover controller.'),
@@ -62,8 +60,6 @@ FILES = {
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
     'train_any.yaml': ('train.parameters:TrainParameters',
                        'The training for robots that differ.'),
-    'train_late.yaml': ('train.parameters:TrainParameters',
-                        'What a training for robots with late commands and joints changes.'),
     'train_published.yaml': ('train.parameters:TrainParameters',
                              'The training with the settings of the publication.'),
     'gap.yaml': ('identify.recording.parameters:GapParameters', 'The gap finder.')}
@@ -248,18 +244,22 @@ def effects() -> str:
     """The catalogue of effects."""
     from beetle_omni_ros.identify.flights.treatment import TREATMENTS
     from beetle_omni_ros.model.effects import CATALOGUE, CONSUMERS, ignored
+    from beetle_omni_ros.model.formula import SCALARS, TARGETS
+    scalars = list(SCALARS)
     apart: dict[tuple, list] = {}
     for name in CATALOGUE:
         for key, consumer in CONSUMERS.items():
             if reason := ignored(key, name):
                 apart.setdefault((consumer, reason), []).append(f'`{name}`')
     rows = [[f'`{name}`', f'`{key}`', spec.unit, _neutral(spec.neutral),
-             f'{_number(spec.low)} to {_number(spec.high)}', 'not fitted' if spec.form
+             '' if spec.text else f'{_number(spec.low)} to {_number(spec.high)}',
+             'not fitted' if spec.form
              else _number(TREATMENTS[name].sizes[key].typical),
              '' if spec.form else _number(TREATMENTS[name].sizes[key].smallest),
              '' if spec.default is None else _neutral(spec.default),
              entry.settings.get(key) and f'`{entry.settings[key]}`' or '',
-             '4, one for each ' + entry.each if entry.each
+             'one for each term' if entry.each == 'term'
+             else '4, one for each ' + entry.each if entry.each
              else '1, or 4 for each joint' if spec.of_each
              else str(len(spec.neutral)) if isinstance(spec.neutral, tuple) else '1']
             for name, entry in CATALOGUE.items()
@@ -282,6 +282,13 @@ def effects() -> str:
             'that has a *default*.\n\n'
             + table(['effect', 'parameter', 'unit', 'neutral', 'range', 'typical', 'smallest',
                      'default', 'replaces', 'numbers'], rows)
+            + '\n## Formula\n\n'
+            + _wrapped('An expression of `formula` is TARGET: VECTOR * SCALAR * ..., a thrust has '
+                       'no vector. ' + ' '.join(f'`{name}`: {", ".join(vectors)}.' for name, (
+                           _, _, vectors, _) in TARGETS.items() if vectors)
+                       + f' Scalars: {", ".join(scalars[:2])}; of rotors, which are summed, also '
+                       + ', '.join(scalars[2:]) + '. Velocities are those of the hubs, thrusts '
+                       'relative to hover, `ground` is (0.25 m / height)^2.') + '\n'
             + '\n## Consumers\n\n'
             + _wrapped(f'The consumers are {", ".join(CONSUMERS.values())}. Every effect acts in '
                        'each of them, except for these. `test/gap/test_consumers.py` tests every '
@@ -307,7 +314,7 @@ def _acts(entry) -> str:
 def _neutral(value) -> str:
     values = set(value) if isinstance(value, tuple) else {value}
     one = values.pop()
-    return 'robot file' if one != one else _number(one)
+    return f'`{one}`' if isinstance(one, str) else 'robot file' if one != one else _number(one)
 
 
 def python() -> str:
@@ -315,7 +322,7 @@ def python() -> str:
     import beetle_omni_ros as module
     from beetle_omni_ros.bags import log
     from beetle_omni_ros.control import base
-    from beetle_omni_ros.show.notebook import NotebookLog
+    from beetle_omni_ros.show.report import NotebookLog
     text = [f'# Python\n\n{MADE}\n{TIMES}']
     for name in module.__all__:
         found = getattr(module, name)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 import fcntl
 from pathlib import Path
+import shutil
 
 import beetle_omni_ros
 
@@ -13,7 +14,7 @@ THREE_POSES = [[-0.7, 0.5, 1.0, -90, 10, -60], [0.9, -0.6, 1.3, 60, 50, 100],
                [0, 0.4, 1.1, 170, 0, 20]]
 # name -> poses, wind, options
 FIVE_POSES = TWO_POSES + THREE_POSES
-FLIGHTS = {'windy_0': (FIVE_POSES, WIND, {'seed': 0}), 'windy_1': (FIVE_POSES, WIND, {'seed': 1}),
+FLIGHTS = {**{f'windy_{seed}': (FIVE_POSES, WIND, {'seed': seed}) for seed in (0, 1)},
            'published': (THREE_POSES, None, {'seed': 5, 'conditions': 'published'})}
 folder: Path | None = None      # set by conftest.py, the same for all workers
 
@@ -27,6 +28,7 @@ def flight(name):
             poses, wind, options = FLIGHTS[name]
             robot, new = beetle_omni_ros.robot(), folder / 'new' / name
             new.parent.mkdir(exist_ok=True)
+            shutil.rmtree(new, ignore_errors=True)      # of a test that exceeded its time
             beetle_omni_ros.simulate('hover', poses, bag=new, **options, plant=replace(
                 robot, effects={'wind': {'force': wind}}) if wind is not None else robot)
             new.rename(bag)

@@ -8,9 +8,9 @@ from beetle_omni_ros.bags.messages import MessageError
 from beetle_omni_ros.bags.topics import ALL
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.targets import TargetChecks
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.readings import BatteryReading, JointReading, PoseReading
+from beetle_omni_ros.model.rotations import BodyState
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 NUMBERS = (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-320, 0.0, -5.0, 1e6)

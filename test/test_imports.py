@@ -28,9 +28,8 @@ ALLOWED = {
     # The command line.
     'start': (),
     'options': ('model', 'control'),
-    'identify_commands': ('options', 'model', 'bags', 'identify'),
-    'improve': ('options', 'model', 'show', 'flight', 'identify'),
-    'commands': ('options', 'identify_commands', 'improve', 'model', 'control', 'drivers',
+    'identify_commands': ('options', 'model', 'bags', 'show', 'flight', 'identify'),
+    'commands': ('options', 'identify_commands', 'model', 'control', 'drivers',
                  'bags', 'show', 'flight', 'identify', 'train', 'ros'),
     'cli': ('model', 'commands', 'options'),
     '__main__': ('cli',),

@@ -127,10 +127,6 @@ def test_every_requirement_states_the_oldest_version(setup_arguments):
         assert 'python_version' in line or re.fullmatch(r'[a-z0-9-]+>=[0-9.]+(,<[0-9.]+)?', line)
 
 
-def test_no_linter_is_declared_that_nothing_runs():
-    assert not [name for name in dependencies('test_depend') if name.startswith('ament_')]
-
-
 def parameter_classes():
     """Shipped parameter file -> the class of its reference."""
     spec = importlib.util.spec_from_file_location('reference', ROOT / 'docs/generate_reference.py')

@@ -31,21 +31,12 @@ HEAD, FIELDS = Struct('<BQ'), Struct('<HIQQ')   # of each record of a file, and 
 
 
 class Recorded(NamedTuple):
-    """
-    One message of a bag, or several of one topic in the order of the file.
+    """One message of a bag, or several of one topic in the order of the file."""
 
-    Attributes:
-        topic: full name; of several messages that without the namespace of the robot.
-        type: ROS type.
-        data: CDR, or list of it.
-        received: time of recording [s], or (N,) times.
-
-    """
-
-    topic: str
-    type: str
-    data: bytes | list[bytes]
-    received: float | np.ndarray
+    topic: str      # full name; of several messages that without the namespace of the robot
+    type: str       # ROS type
+    data: bytes | list[bytes]       # CDR
+    received: float | np.ndarray    # time of recording [s], or (N,) times
 
 
 def bag_files(path: str | Path) -> list[Path]:

@@ -21,9 +21,9 @@ from beetle_omni_ros.bags.messages import Diagnostic, MessageError, new, Wrench
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.model import readings, rotations
 from beetle_omni_ros.model.allocation import ActuatorHealth
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.mode import Mode
 from beetle_omni_ros.model.parameters import JOINT_NAMES, ROTOR_NAMES
+from beetle_omni_ros.model.rotations import BodyState
 
 WORLD, BODY = 'world', 'base_link'
 JOINTS, ROTORS = list(JOINT_NAMES), list(ROTOR_NAMES)
@@ -38,23 +38,13 @@ TRAJECTORY_TYPE = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 
 
 class Form(NamedTuple):
-    """
-    One kind of message.
+    """One kind of message."""
 
-    Attributes:
-        type: ROS message type.
-        value: class of its values.
-        read: message -> value; MessageError for another layout.
-        write: value -> message.
-        take: message -> value for use in flight; MessageError for unusable values.
-
-    """
-
-    type: str
-    value: type
-    read: Callable[[Any], Any]
-    write: Callable[[Any], Any]
-    take: Callable[[Any], Any]
+    type: str       # ROS message type
+    value: type     # class of its values
+    read: Callable[[Any], Any]      # message -> value; MessageError for another layout
+    write: Callable[[Any], Any]     # value -> message
+    take: Callable[[Any], Any]      # message -> value in flight; MessageError for an unusable one
 
 
 def form(name: str, value: type, read: Callable[[Any], Any], write: Callable[[Any], Any],
@@ -283,11 +273,6 @@ def _take_joints(message):
     return readings.JointReading(seconds(message.header.stamp), position, velocity)
 
 
-def _read_command(message):
-    return Command(seconds(message.header.stamp), _of(message, 'position', JOINTS),
-                   _of(message, 'effort', ROTORS))
-
-
 JOINT = Form(JOINT_STATE, readings.JointReading, _read_joints, lambda value: _joint_state(
     value.stamp, value.names, position=value.position, velocity=value.velocity,
     effort=value.effort), _take_joints)
@@ -295,7 +280,9 @@ ROTOR = form(JOINT_STATE, readings.RotorReading, lambda message: readings.RotorR
     seconds(message.header.stamp), _of(message, 'velocity', ROTORS)),
     lambda value: _joint_state(value.stamp, ROTORS, velocity=value.speed))
 # Tilts are positions and thrusts are efforts; unused values are NaN.
-COMMAND = form(JOINT_STATE, Command, _read_command, lambda value: _joint_state(
+COMMAND = form(JOINT_STATE, Command, lambda message: Command(
+    seconds(message.header.stamp), _of(message, 'position', JOINTS),
+    _of(message, 'effort', ROTORS)), lambda value: _joint_state(
     value.stamp, COMMAND_NAMES, position=[*value.tilt, *NO_VALUE],
     effort=[*NO_VALUE, *value.thrust]), ('tilt', 'thrust'))
 

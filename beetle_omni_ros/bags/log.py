@@ -72,10 +72,10 @@ class Series(SimpleNamespace):
         return slice(int(np.searchsorted(self.t, begin - EDGE, side='left')),
                      int(np.searchsorted(self.t, end + EDGE, side='right')))
 
-    def covers(self, begin: float, end: float, gap: float = 0.1) -> bool:
-        """Whether the first and last sample in the window are within ``gap`` [s] of its edges."""
+    def covers(self, begin: float, end: float) -> bool:
+        """Whether the first and last sample in the window are within 0.1 s of its edges."""
         times = self.t[self.window(begin, end)]
-        return len(times) > 0 and times[0] <= begin + gap and times[-1] >= end - gap
+        return len(times) > 0 and times[0] <= begin + 0.1 and times[-1] >= end - 0.1
 
 
 @dataclass
@@ -152,8 +152,7 @@ class FlightLog:
 
     def controllers(self) -> list[str]:
         """Return the names of the controllers that flew, in this order."""
-        names = [name for _, name in self.active_controller() if name]
-        return list(dict.fromkeys(names))
+        return list(dict.fromkeys(name for _, name in self.active_controller() if name))
 
     def named_faults(self) -> dict[str, float]:
         """Return the supervisor's fault names -> time of the first report [s], by time."""
@@ -383,8 +382,7 @@ def estimate_errors(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 def reference_poses(target: Target, times: np.ndarray):
     """Return (n, 3) positions and (n, 4) quaternions of a target at ``times`` (n,) [s]."""
     if isinstance(target, PoseTarget):
-        return np.tile(target.position, (len(times), 1)), np.tile(target.quaternion,
-                                                                  (len(times), 1))
+        return [np.tile(part, (len(times), 1)) for part in (target.position, target.quaternion)]
     references = target.sample(times)
     return references.position, references.quaternion
 
@@ -397,7 +395,5 @@ def hold(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def inside(times: np.ndarray, intervals: list[tuple[float, float]]) -> np.ndarray:
     """Return a mask of the times that are in one of the intervals."""
-    mask = np.zeros(len(times), dtype=bool)
-    for begin, end in intervals:
-        mask |= (times >= begin - EDGE) & (times <= end + EDGE)
-    return mask
+    return np.any([(times >= begin - EDGE) & (times <= end + EDGE) for begin, end in intervals]
+                  or [np.zeros(len(times), dtype=bool)], axis=0)

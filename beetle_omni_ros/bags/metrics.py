@@ -88,14 +88,8 @@ def task_of(log: FlightLog) -> Task | None:
 
 
 def _split(log, task):
-    """
-    Split a flight by controllers.
-
-    Returns:
-        Controller -> indices of its pose targets that lasted to the end of U, and intervals
-        (begin, end) of the flight towards its targets [s].
-
-    """
+    """Controller -> indices of its pose targets, and intervals (begin, end) towards them [s]."""
+    # Only pose targets that lasted to the end of U.
     changes = log.active_controller()
     parts: dict[str, tuple[list, list]] = {name: ([], []) for _, name in changes if name}
     if not parts or not log.targets:
@@ -176,11 +170,8 @@ def _controller_metrics(log, task, name, poses, intervals, *, is_alone):
 
 
 def _early_end(log, task):
-    """
-    Time and text of a landing or stop before the end of the task; (inf, '') for none.
-
-    If the task is unknown or ends with the loss of control, only a landing with a fault counts.
-    """
+    """Time and text of a landing or stop before the end of the task; (inf, '') for none."""
+    # If the task is unknown or ends with the loss of control, only a landing with a fault counts.
     start = log.targets[0].stamp if log.targets else np.inf
     due = start + task.duration - END_MARGIN if task else np.inf
     for t, state in zip(log.state_t, log.states, strict=True):

@@ -36,27 +36,17 @@ LATCHED_LOG = Qos(50, latched=True)
 
 @dataclass(frozen=True)
 class Topic:
-    """
-    One topic.
+    """One topic."""
 
-    Attributes:
-        name: relative name.
-        qos: quality of service that its publisher offers.
-        meaning: description for the reference page.
-        type, value, read, write, take: as of :class:`.conversions.Form`.
-        required: whether a bag without it gets a warning.
-
-    """
-
-    name: str = field(compare=False)    # command topics of two controllers are equal otherwise
-    qos: Qos
-    meaning: str
-    type: str
+    name: str = field(compare=False)    # relative; command topics are equal otherwise
+    qos: Qos            # quality of service that its publisher offers
+    meaning: str        # description for the reference page
+    type: str           # this and the next four: as of :class:`.conversions.Form`
     value: type
     read: Callable[[Any], Any]
     write: Callable[[Any], Any]
     take: Callable[[Any], Any]
-    required: bool = False
+    required: bool = False      # whether a bag without it gets a warning
 
 
 def _topic(name, of, qos, meaning, **options):

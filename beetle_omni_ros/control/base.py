@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from beetle_omni_ros.model.allocation import ActuatorHealth, ALL_HEALTHY, NO_ZEROS, ROTORS
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.mode import FLYING, Mode
+from beetle_omni_ros.model.rotations import BodyState
 
 AT_REST = np.zeros(3)           # velocity of a pose
 AT_REST.flags.writeable = False
@@ -26,38 +26,21 @@ LIBRARIES = (str(Path(__file__).resolve().parents[1]),
 
 @dataclass(frozen=True)
 class Command:
-    """
-    Targets of the actuators, computed by a controller.
+    """Targets of the actuators, computed by a controller."""
 
-    Attributes:
-        stamp: of the state estimate from which it was computed [s].
-        tilt: (4,) tilt joint targets [rad].
-        thrust: (4,) rotor thrust targets [N].
-
-    """
-
-    stamp: float
-    tilt: np.ndarray
-    thrust: np.ndarray
+    stamp: float            # of the state estimate from which it was computed [s]
+    tilt: np.ndarray        # (4,) tilt joint targets [rad]
+    thrust: np.ndarray      # (4,) rotor thrust targets [N]
 
 
 @dataclass(slots=True, eq=False)
 class State(BodyState):
-    """
-    The estimated state, input of a controller: a BodyState with the tilt joints.
+    """The estimated state, input of a controller: a BodyState with the tilt joints."""
 
-    Attributes:
-        tilt: (4,) latest measured tilt angles [rad].
-        tilt_velocity: (4,) their rates [rad/s].
-        tilt_stamp: capture time of ``tilt`` [s].
-        command: the last executed command, of any controller, or None before the first.
-
-    """
-
-    tilt: np.ndarray
-    tilt_velocity: np.ndarray
-    tilt_stamp: float
-    command: Command | None = None
+    tilt: np.ndarray            # (4,) latest measured tilt angles [rad]
+    tilt_velocity: np.ndarray   # (4,) their rates [rad/s]
+    tilt_stamp: float           # capture time of ``tilt`` [s]
+    command: Command | None = None      # last executed one, of any controller; None: none yet
 
     @classmethod
     def join(cls, estimate: BodyState, joints: Any, command: Command | None = None) -> State:

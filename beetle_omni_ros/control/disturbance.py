@@ -2,29 +2,36 @@
 Disturbance estimates for offset-free control.
 
 Three slow estimates integrate the prediction error of the model: an external force in world, an
-external torque in body and an offset of each servo's resting angle. For a robot file with
-``joint_friction`` the targets overcome it. docs/explanation/nmpc.md has the reasons.
+external torque in body and an offset of each servo's resting angle. An additional delay of the
+commands is estimated, too (:mod:`control.latency`). For a robot file with ``joint_friction`` the
+targets overcome it. docs/explanation/nmpc.md has the reasons.
 """
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
+from beetle_omni_ros.control.latency import LatencyEstimator
 from beetle_omni_ros.model import dynamics as model
+from beetle_omni_ros.model import native
 from beetle_omni_ros.model.allocation import ActuatorHealth, ALL_HEALTHY, clipped
-from beetle_omni_ros.model.native import buffered
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.rotations import matrix
 from beetle_omni_ros.model.schema import parameter
 
+PERIOD = 0.01       # [s] between two states
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
 SHORT = 0.002           # [s] a command change nearer to an end of a span is treated as at this end
 UNNOTICED = 0.3     # [s] before a fault is reported: the estimates contain the fault
 RESOLUTION = 0.0015  # [rad] change of a target that reverses a servo: an encoder count
 LIMIT = np.repeat([60.0, 5.0, 0.3], [3, 3, 4])  # of the estimates [N], [N m], [rad]
 TILT_CORRECTION = 0.2   # share of a measured tilt error that corrects the tilt model in each step
+# Initial standard deviations of predicted accelerations [m/s^2], [rad/s^2] and of tilts [rad].
+MOTION_NOISE, TILT_NOISE = np.repeat([0.3, 3.0], 3), np.full(4, 0.01)
+BLOCK = 0.075       # [s] mean accelerations over more than this give the delay: eight steps
 HISTORY = 64        # number of stored states and commands, more than any latency needs
 
 
@@ -38,6 +45,9 @@ class DisturbanceParameters:
         4.0, doc='bandwidth of the external torque', unit='rad/s', low=0, high=50)
     tilt_bandwidth: float = parameter(
         3.0, doc='bandwidth of the servo offsets', unit='rad/s', low=0, high=50)
+    latency: float = parameter(
+        0.05, doc='largest additional delay of commands, and of joint feedback, that is estimated '
+        'and predicted; 0: none', unit='s', low=0, high=0.2)
 
 
 class DisturbanceEstimator:
@@ -48,21 +58,31 @@ class DisturbanceEstimator:
         robot: nominal robot.
         parameters: bandwidths.
         command_delay: from a command to the actuators without the robot file's effects [s].
-        advance: :func:`dynamics.integrator` of the robot.
+        advance: :func:`dynamics.integrator`; None: of the robot without joint_friction, of which
+            this class has its own model.
 
     Attributes:
-        delay: from a command to the actuators [s], with the mean of the robot file's delays of
-            tilts and thrusts, with which the NMPC's error on a lemniscate is smallest.
-        encoder_delay: from the capture of tilts to their stamp [s].
+        known_delay: from a command to the actuators [s], with the mean of the robot file's delays
+            of tilts and thrusts, with which the NMPC's error on a lemniscate is smallest.
         disturbance: (10,) force in world [N], torque in body [N m], servo offsets [rad].
 
     """
 
     def __init__(self, robot: RobotParameters, parameters: DisturbanceParameters,
-                 command_delay: float, advance: ca.Function):
-        self._advance, self.encoder_delay = buffered(advance), robot.sensors.encoder_delay
-        self.delay = max(command_delay + sum(robot.command_delays) / 2, 0.0)
-        p = parameters
+                 command_delay: float, advance: ca.Function | None = None):
+        if advance is None:
+            advance = native.compiled(model.integrator(replace(robot, effects={
+                name: values for name, values in robot.effects.items()
+                if name != 'joint_friction'})))
+        self._advance, self._known_encoder_delay = (native.buffered(advance),
+                                                    robot.sensors.encoder_delay)
+        self.known_delay = max(command_delay + sum(robot.command_delays) / 2, 0.0)
+        p, self._gravity = parameters, robot.gravity
+        self._late = LatencyEstimator(p.latency, max(p.force_bandwidth, p.torque_bandwidth),
+                                      MOTION_NOISE)
+        self._late_tilts = LatencyEstimator(
+            p.latency, p.tilt_bandwidth + TILT_CORRECTION / PERIOD, TILT_NOISE)
+        self._estimates_latency = p.latency > 0
         # bandwidth times inertia: turns a velocity error of one step into a change of force
         self._force_gain = p.force_bandwidth * robot.mass
         self._torque_gain = p.torque_bandwidth * robot.inertia
@@ -74,8 +94,26 @@ class DisturbanceEstimator:
         self._movable = np.ones(4)
         self.reset()
 
+    @property
+    def latency(self) -> float:
+        """Estimated additional delay of the commands [s]."""
+        return self._late.latency
+
+    @property
+    def delay(self) -> float:
+        """From a command to the actuators [s]."""
+        return self.known_delay + self.latency
+
+    @property
+    def encoder_delay(self) -> float:
+        """From the capture of tilts to their stamp [s]."""
+        return self._known_encoder_delay + self._late_tilts.latency
+
     def reset(self):
         """Reset all estimates."""
+        self._late.reset()
+        self._late_tilts.reset()
+        self._begin_block()
         self.disturbance = np.zeros(model.DISTURBANCE_SIZE)
         self._state: np.ndarray | None = None
         self._direction = np.zeros(4)
@@ -104,6 +142,22 @@ class DisturbanceEstimator:
         """Observe, and predict the state (25,) at which a command for ``state`` acts."""
         return self.flown(self.observe(state), state.stamp, self.delay)
 
+    def ahead(self, state: State) -> State:
+        """Update with one state; returns it as far ahead as the commands act later than known."""
+        seen = present = self.observe(state)
+        if self.latency > SHORT:
+            seen = self.flown(present, state.stamp, self.latency)
+        return flown(state, seen, self.reading(state) + seen[model.TILT] - present[model.TILT])
+
+    def reading(self, state: State) -> np.ndarray:
+        """Measured tilts (4,) [rad], moved on by the estimated additional delay of the joints."""
+        if self._late_tilts.latency < SHORT:
+            return state.tilt
+        stamp = state.tilt_stamp - self._known_encoder_delay
+        late, due = (self._modelled_tilt(each) for each in (
+            stamp - self._late_tilts.latency, stamp))
+        return state.tilt if late is None or due is None else state.tilt + due - late
+
     def observe(self, state: State) -> np.ndarray:
         """Update with one state estimate; returns the (25,) full state at its stamp."""
         if state.command is not None and (
@@ -119,6 +173,9 @@ class DisturbanceEstimator:
             thrust = np.zeros(4) if state.command is None else state.command.thrust
             actuators = np.concatenate([state.tilt, state.tilt_velocity, thrust])
             self._tilts.clear()
+            self._late.pause()
+            self._late_tilts.pause()
+            self._begin_block()
         else:
             predicted = self.flown(self._state, self._stamp, step)
             self._learn(state, predicted)
@@ -168,11 +225,31 @@ class DisturbanceEstimator:
         return (np.zeros(4) if self._state is None else self._state[model.TILT]), np.zeros(4)
 
     def _learn(self, state, predicted):
+        velocity = state.velocity - predicted[model.VELOCITY]
+        rate = state.angular_velocity - predicted[model.RATE]
         change = np.zeros(model.DISTURBANCE_SIZE)
-        change[model.FORCE] = self._force_gain * (state.velocity - predicted[model.VELOCITY])
-        change[model.TORQUE] = self._torque_gain * (
-            state.angular_velocity - predicted[model.RATE])
+        change[model.FORCE] = self._force_gain * velocity
+        change[model.TORQUE] = self._torque_gain * rate
         self.disturbance = clipped(self.disturbance + change, -LIMIT, LIMIT)
+        if self._estimates_latency:
+            self._errors += np.concatenate([velocity, rate])
+            self._changes += predicted - self._state
+            self._span += state.stamp - self._stamp
+            if self._span > BLOCK:
+                self._learn_latency(matrix(state.quaternion).T)
+
+    def _learn_latency(self, to_body):
+        """Compare the mean accelerations since the last call, in base_link."""
+        changes, errors, span = self._changes, self._errors, self._span
+        given = np.concatenate([changes[model.VELOCITY], changes[model.RATE]])
+        given[2] += self._gravity * span
+        given[:3], errors[:3] = to_body @ given[:3], to_body @ errors[:3]
+        self._late.observe(given / span, errors / span, span)
+        self._begin_block()
+
+    def _begin_block(self):
+        self._errors, self._changes = np.zeros(6), np.zeros(model.STATE_SIZE)
+        self._span = 0.0
 
     def _correct_tilt(self, state, present, step):
         """Compare the encoders with the tilt model at their capture time."""
@@ -181,6 +258,8 @@ class DisturbanceEstimator:
             return
         limit = LIMIT[model.TILT_OFFSET]
         error = self._movable * clipped(state.tilt - modelled, -limit, limit)
+        if self._estimates_latency:
+            self._late_tilts.observe(modelled, error, step)
         present[model.TILT] += TILT_CORRECTION * error
         change = self._tilt_bandwidth * step * error
         if self._sticks and self._commands:
@@ -202,3 +281,9 @@ class DisturbanceEstimator:
                 return tilt + part * (later[1] - tilt)
             later = (time, tilt)
         return None
+
+
+def flown(state: State, x: np.ndarray, tilt: np.ndarray) -> State:
+    """State with the motion of ``x`` (25,) and the tilts (4,) [rad]."""
+    return State(state.stamp, x[model.POSITION], x[model.VELOCITY], x[model.QUATERNION],
+                 x[model.RATE], tilt, x[model.TILT_RATE], state.tilt_stamp, state.command)

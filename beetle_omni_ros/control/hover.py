@@ -206,14 +206,11 @@ class HoverController:
         return (tilt, thrust) if self._health.healthy else self._health.possible(tilt, thrust)
 
     def _thrust_on_the_way(self, goal, tilt):
-        """
-        Thrusts along the present rotor directions that are nearest to the desired wrench.
-
-        Least squares of accelerations: a rotor that points in a wrong direction is throttled, and
-        also the rotors whose torque it should balance. If a joint is far from its goal, the wrench
-        cannot be met. An angular acceleration then counts as that of a rotor: otherwise all rotors
-        would stop for the sake of the torque.
-        """
+        """Thrusts along the present rotor directions that are nearest to the desired wrench."""
+        # Least squares of accelerations: a rotor that points in a wrong direction is throttled,
+        # and also the rotors whose torque it should balance. If a joint is far from its goal, the
+        # wrench cannot be met. An angular acceleration then counts as that of a rotor: otherwise
+        # all rotors would stop for the sake of the torque.
         rotors, matrix = self._robot.rotors, self._scaled
         if np.abs(goal.tilt - tilt).max() > FAR:
             matrix = matrix * self._arms

@@ -23,6 +23,7 @@ from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.control.disturbance import (
     DisturbanceEstimator,
     DisturbanceParameters,
+    flown,
     LONGEST_STEP,
 )
 from beetle_omni_ros.model import dynamics as model
@@ -46,20 +47,18 @@ class ModelMatching:
         robot: the flown robot.
         command_delay: from the state stamp to the actuators without effects [s].
         latest: number of own commands that are recognised when they are reported as executed.
+        latency: largest additional delay that is estimated [s].
 
     """
 
     def __init__(self, trained: RobotParameters, robot: RobotParameters, command_delay: float,
-                 latest: int):
+                 latest: int, latency: float = 0.0):
         self._trained, self._robot = trained, robot
-        frictionless = replace(robot, effects={
-            name: values for name, values in robot.effects.items() if name != 'joint_friction'})
-        self._estimator = DisturbanceEstimator(robot, DisturbanceParameters(), command_delay,
-                                               native.compiled(model.integrator(frictionless)))
+        self._estimator = DisturbanceEstimator(
+            robot, DisturbanceParameters(latency=latency), command_delay)
         # Of tilts and thrusts the later ones count: a loop forgives a command that acts earlier.
-        known, self._estimator.delay = (max(command_delay + max(each.command_delays), 0.0)
-                                        for each in (trained, robot))
-        self._ahead = max(self._estimator.delay - known, 0.0)
+        self._own_delay, self._estimator.known_delay = (
+            max(command_delay + max(each.command_delays), 0.0) for each in (trained, robot))
         self._wrenches = native.buffered(native.compiled(wrenches(trained, robot)))
         self._scale = robot.thrust_scale / trained.thrust_scale
         before, after = trained.joints, robot.joints
@@ -72,6 +71,11 @@ class ModelMatching:
         self._weights = np.repeat([TILT_SHARE / robot.hover_thrust ** 2, 1.0], 4)
         self._latest: deque[tuple[Command, Command]] = deque(maxlen=latest)
         self.reset()
+
+    @property
+    def latency(self) -> float:
+        """Estimated additional delay of the commands [s]."""
+        return self._estimator.latency
 
     def reset(self) -> None:
         """Forget the flight."""
@@ -102,12 +106,11 @@ class ModelMatching:
                 self._change - self._acting)
             self._thrust = self._thrust + (1 - np.exp(
                 -step / self._trained.rotors.time_constant)) * (self._own.thrust - self._thrust)
+        self._ahead = max(self._estimator.delay - self._own_delay, 0.0)
         self._seen = seen = self._estimator.flown(present, state.stamp, self._ahead)
-        moved = seen - present
-        return replace(state, position=seen[model.POSITION], velocity=seen[model.VELOCITY],
-                       quaternion=seen[model.QUATERNION], angular_velocity=seen[model.RATE],
-                       tilt=state.tilt + moved[model.TILT] - self._acting[:4],
-                       tilt_velocity=seen[model.TILT_RATE], command=own or state.command)
+        tilt = self._estimator.reading(state) + seen[model.TILT] - present[model.TILT] \
+            - self._acting[:4]
+        return replace(flown(state, seen, tilt), command=own or state.command)
 
     def sent(self, own: Command) -> Command:
         """Command for the flown robot, for the policy's own one on :meth:`observed`."""

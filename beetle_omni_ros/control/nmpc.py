@@ -1,6 +1,6 @@
 """Nonlinear model predictive control by real-time iteration, and its parameters."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +10,6 @@ from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.ocp import Rti, WEIGHTS
 from beetle_omni_ros.control.references import ReferencePlanner
 from beetle_omni_ros.model import dynamics as model
-from beetle_omni_ros.model import native
 from beetle_omni_ros.model.allocation import ActuatorHealth, ALL_HEALTHY, clipped
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import group, parameter, ParameterError, ParameterFile, RunError
@@ -146,17 +145,13 @@ class NmpcController:
         servo_lag, tilt, tilt_rate, thrust_max = p.actuators(robot)
         self._parameters, self.reach = p, p.reach
         self._robot = robot
-        # The estimator has its own model of the servos' friction.
-        advance = model.integrator(replace(robot, effects={
-            name: values for name, values in robot.effects.items() if name != 'joint_friction'}))
         try:
             self._rti = Rti(robot, servo_lag, p.model.rotor_lag, p.horizon,
                             SLACKS if p.limits.soft else None, TOLERANCE, MAX_ITERATIONS,
                             p.limits.tilt_rate_intervals - 1)
         except RunError as error:
             raise ParameterError(f'the NMPC needs a C compiler: {error}') from None
-        self._estimator = DisturbanceEstimator(robot, p.disturbance, p.model.command_delay,
-                                               native.compiled(advance))
+        self._estimator = DisturbanceEstimator(robot, p.disturbance, p.model.command_delay)
         self._planner = ReferencePlanner(robot, np.r_[0.0, np.cumsum(p.horizon)], p.unwind,
                                          servo_lag)
         self._weights, self._state_size = p.weights.vector(), self._rti.states.shape[1]
@@ -244,6 +239,7 @@ class NmpcController:
         d = self._estimator.disturbance
         return {'steps': self._steps, 'unsolved': self._unsolved, 'iterations': self._iterations,
                 **self._guidance.diagnostics(),
+                'latency_estimate_s': self._estimator.latency,
                 'force_estimate_N': float(np.linalg.norm(d[model.FORCE])),
                 'torque_estimate_Nm': float(np.linalg.norm(d[model.TORQUE])),
                 'servo_offset_rad': float(np.max(np.abs(d[model.TILT_OFFSET])))}

@@ -2,19 +2,19 @@
 
 from collections import deque
 from dataclasses import dataclass
-from math import inf
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
+from beetle_omni_ros.control.disturbance import DisturbanceEstimator, DisturbanceParameters
 from beetle_omni_ros.control.guidance import Guidance
+from beetle_omni_ros.control.matching import ModelMatching
 from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.rotations import entries
 from beetle_omni_ros.model.schema import parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
-LONGEST_STEP = 0.1      # [s] between two states; after a longer gap the history is empty
 LATEST = 10             # steps within which a command is reported as the executed command
 COMMAND_DELAY = 0.01    # [s] from the state stamp to the actuators, for the disturbance estimate
 # An action beyond is a fault: it is sent to the supervisor unchanged; smaller ones are clipped to
@@ -29,6 +29,9 @@ class PolicyParameters(ParameterFile, file='rl.yaml'):
     policy: str = parameter(DEFAULT, doc="ONNX file, in the package's share or any path")
     matching: bool = parameter(
         True, doc='fly another robot than that of the training by model matching')
+    latency: float = parameter(
+        DisturbanceParameters().latency, doc='largest additional delay of the commands that is '
+        'estimated and predicted; 0: none', unit='s', low=0, high=0.2)
     reach: float = parameter(6.5, doc='a target farther from the robot is refused', unit='m',
                              low=0.5, high=1000)
     without: str = parameter('', doc="layers of the guidance that are off: names with commas, or "
@@ -50,32 +53,29 @@ class PolicyController:
         self.network = PolicyNetwork(p.policy, robot)
         self.contract = contract = self.network.contract
         trained = contract.trained_robot(robot)
-        self._matching = None
+        self._matching: ModelMatching | None = None
+        self._estimator: DisturbanceEstimator | None = None
+        latency = p.latency
         if p.matching and trained is not robot:
-            from beetle_omni_ros.control.matching import ModelMatching
-            self._matching = ModelMatching(trained, robot, COMMAND_DELAY, LATEST)
+            self._matching = ModelMatching(trained, robot, COMMAND_DELAY, LATEST, latency)
+            latency = 0.0
         self.name, self.period, self.reach = contract.name, 1 / contract.rate_hz, p.reach
         self._scale, self._offset = contract.action_scale, contract.action_offset
         tilt, rotors = robot.joints.position_limit, robot.rotors
         self._limits = [(-tilt, tilt)] * 4 + [(rotors.thrust_min, rotors.thrust_max)] * 4
         self._hover = [robot.hover_thrust] * 4
-        self._estimator = None
-        if contract.memory:
-            from beetle_omni_ros.control import disturbance
-            from beetle_omni_ros.model.dynamics import integrator
+        if contract.memory or latency:
             # The disturbance of another robot is its difference from that of the training.
-            self._estimator = disturbance.DisturbanceEstimator(
-                trained, disturbance.DisturbanceParameters(), COMMAND_DELAY, integrator(trained))
+            self._estimator = DisturbanceEstimator(
+                trained, DisturbanceParameters(latency=latency), COMMAND_DELAY)
         self._guidance = Guidance(robot.tilt_axes, p.without)
         self.guidance = self._guidance.text
         self.reset()
 
     def reset(self) -> None:
-        """Reset the last commands, the history, the estimate and all counts."""
+        """Reset the last commands, the estimate and all counts."""
         self._steps = self._faults = self._cut = 0
         self._guidance.reset()
-        self.network.reset()
-        self._stamp = -inf
         self._latest: deque[list[float]] = deque(maxlen=LATEST)
         if self._estimator:
             self._estimator.reset()
@@ -85,11 +85,10 @@ class PolicyController:
     def step(self, state: State, target: Target) -> Command:
         """One command for one state."""
         self._steps += 1
-        if state.stamp - self._stamp > LONGEST_STEP:
-            self.network.reset()
-        self._stamp = state.stamp
         if self._matching:
             state = self._matching.observed(state)
+        if self._estimator:
+            state = self._estimator.ahead(state)
         command = state.command
         executed = command and command.tilt.tolist() + command.thrust.tolist()
         if isinstance(target, PoseTarget):      # in charge: the executed command is a latest one
@@ -97,8 +96,7 @@ class PolicyController:
         before = executed or state.tilt.tolist() + self._hover
         observation = observed(state, target.at(state.stamp), [
             (v - o) / s for v, o, s in zip(before, self._offset, self._scale)])
-        if self._estimator:
-            self._estimator.observe(state)
+        if self._estimator and self.contract.memory:
             observation += disturbed(state, self._estimator.disturbance)
         action = self.network(observation)
         values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
@@ -118,7 +116,10 @@ class PolicyController:
             'policy': self.contract.name, 'steps': self._steps,
             'faulty_actions': self._faults, 'steps_at_a_limit': self._cut,
             **self._guidance.diagnostics()}
-        if self._estimator:
+        known = self._matching or self._estimator
+        if known:
+            values['latency_estimate_s'] = known.latency
+        if self._estimator and self.contract.memory:
             d = self._estimator.disturbance
             values['force_estimate_N'] = float(np.linalg.norm(d[:3]))
             values['torque_estimate_Nm'] = float(np.linalg.norm(d[3:6]))

@@ -28,9 +28,7 @@ from beetle_omni_ros.model.schema import nest, ParameterError, quoted, shortened
 
 log = logging.getLogger(__name__)
 FORMAT = 'beetle_omni_policy/1'
-INPUT, OUTPUT, HISTORY, NEXT_HISTORY = 'observation', 'action', 'history', 'next_history'
-# Columns of an observation that a history keeps of each earlier step: motion, tilts, action.
-REMEMBERED, ROW = (slice(0, 6), slice(21, 33)), 18
+INPUT, OUTPUT = 'observation', 'action'
 TILT_SCALE, THRUST_SCALE = 0.25, 0.5   # [rad], [N] for an action of 1, as published
 RATE_HZ = 100
 LONGEST = 500           # characters of differences in a message: metadata may hold anything
@@ -187,10 +185,12 @@ def robot_hash(robot: RobotParameters | dict) -> str:
 
 
 def _plain(value):
-    """Nested mapping with floats and lists of floats."""
+    """Nested mapping with floats, lists of floats and lists of text."""
     if isinstance(value, dict):
         return {key: _plain(each) for key, each in value.items()}
-    return value if value is None else np.asarray(value, dtype=float).tolist()
+    array = np.asarray(value)
+    return value if value is None else (
+        array if array.dtype.kind == 'U' else array.astype(float)).tolist()
 
 
 def _arrays(values):
@@ -250,10 +250,7 @@ def session(data: bytes):
 
 class PolicyNetwork:
     """
-    One policy, on the calling thread alone, with fixed buffers for inputs and outputs.
-
-    A policy with a history returns at each call the history that the next call gives to it; zeros
-    are an empty one.
+    One policy, on the calling thread alone, with fixed buffers for input and output.
 
     Raises:
         ParameterError: one line with the file and what is missing, broken or different.
@@ -278,14 +275,7 @@ class PolicyNetwork:
         """Action (8) for an observation (n), both in plain numbers."""
         self._input[0] = observation
         self._session.run_with_iobinding(self._binding)
-        if self._history is not None:
-            self._history[:] = self._next
         return self._output[0].tolist()
-
-    def reset(self) -> None:
-        """Empty the history."""
-        if self._history is not None:
-            self._history[:] = 0.0
 
     def _open(self, data, robot):
         """Check contract and tensors, let the session use two arrays at every call, warm up."""
@@ -296,25 +286,17 @@ class PolicyNetwork:
         size = self.contract.observation_size
         self._input = np.zeros((1, size), np.float32)
         self._output = np.zeros((1, len(self.contract.actions)), np.float32)
-        self._history = self._next = None
-        tensors = network.get_inputs()
-        inputs, outputs = {INPUT: self._input}, {OUTPUT: self._output}
-        if len(tensors) > 1:    # any number of rows
-            rows = tensors[1].shape[-1] // ROW if isinstance(tensors[1].shape[-1], int) else 1
-            self._history, self._next = np.zeros((2, 1, 1 + ROW * rows), np.float32)
-            inputs[HISTORY], outputs[NEXT_HISTORY] = self._history, self._next
         binding = self._binding = network.io_binding()
-        for bind, arrays, found in ((binding.bind_input, inputs, tensors),
-                                    (binding.bind_output, outputs, network.get_outputs())):
-            given = [(tensor.name, tensor.type, *tensor.shape[1:]) for tensor in found]
-            expected = [(name, 'tensor(float)', array.shape[1]) for name, array in arrays.items()]
-            if given != expected:
-                raise ParameterError(f'expected {expected}, found {given}')
-            for name, array in arrays.items():
-                bind(name, 'cpu', 0, np.float32, array.shape, array.ctypes.data)
+        for name, bind, array, found in (
+                (INPUT, binding.bind_input, self._input, network.get_inputs()),
+                (OUTPUT, binding.bind_output, self._output, network.get_outputs())):
+            tensors = [(tensor.name, tensor.type, *tensor.shape[1:]) for tensor in found]
+            expected = [(name, 'tensor(float)', array.shape[1])]
+            if tensors != expected:
+                raise ParameterError(f'expected {expected}, found {tensors}')
+            bind(name, 'cpu', 0, np.float32, array.shape, array.ctypes.data)
         for _ in range(WARM_UP):
             action = self([0.1] * size)
-        self.reset()
         if not all(map(isfinite, action)):
             raise ParameterError('the action for an observation of 0.1 is not finite')
         return other

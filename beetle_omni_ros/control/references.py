@@ -83,12 +83,9 @@ class ReferencePlanner:
         return references
 
     def _turned(self, target, tilt, quaternion, present):
-        """
-        Joints that have half a turn to go turn with the body, in directions chosen once.
-
-        Otherwise errors decide the direction of each joint. Joints that turn against each other
-        cost up to a metre of height.
-        """
+        """Joints that have half a turn to go turn with the body, in directions chosen once."""
+        # Otherwise errors decide the direction of each joint. Joints that turn against each other
+        # cost up to a metre of height.
         if self._turned_to is None or not target.same_pose(self._turned_to):
             self._turned_to, self._towards = target, None
             tied = np.abs(np.abs(tilt - present) - np.pi) < HALF_TURN
@@ -105,11 +102,8 @@ class ReferencePlanner:
         return np.where(nearer & legal & self._movable, other, tilt)
 
     def _unwound(self, tilt, present):
-        """
-        Choose the tilts within +-pi unless the joint would have to travel much farther.
-
-        A joint near its stop would have to turn far for the next pose: the robot would fall.
-        """
+        """Choose the tilts within +-pi unless the joint would have to travel much farther."""
+        # A joint near its stop would have to turn far for the next pose: the robot would fall.
         if max(map(abs, tilt.tolist())) <= np.pi:
             return tilt
         other = tilt - 2 * np.pi * np.sign(tilt)

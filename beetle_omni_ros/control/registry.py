@@ -56,7 +56,6 @@ class ControllerEntry:
     description: str = ''
     parameters_file: str = ''   # shipped file of them; in the package's share, or any path
     policy_file: str = ''       # its network
-    option: str = ''        # of the command line, replaces the file of this controller only
     flies_degraded: bool = False    # with failed actuators
     stands_by: bool = False     # in the ROS graph
     compared: bool = False  # by default
@@ -127,56 +126,15 @@ class ControllerEntry:
         return reach_of(parameters if hasattr(parameters, 'reach') else self.make(robot))
 
 
-_NMPC = 'beetle_omni_ros.control.nmpc:NmpcController'
-_POLICY = 'beetle_omni_ros.control.policy:PolicyController'
-SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
-    ControllerEntry(
-        name='nmpc', label='NMPC', description='offset-free, params/nmpc.yaml', controller=_NMPC,
-        parameters_file='params/nmpc.yaml', option='--nmpc', flies_degraded=True, stands_by=True,
-        compared=True),
-    ControllerEntry(
-        name='rl', label='RL', description='the learned policy, 33 observations',
-        controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
-        option='--policy', stands_by=True, compared=True),
-    ControllerEntry(
-        name='rl_bare', label='RL, bare', description='the learned policy without guidance',
-        controller=_POLICY, parameters_file='params/rl_bare.yaml', policy_file='policies/rl.onnx',
-        compared=True),
-    ControllerEntry(
-        name='rl_any', label='RL, any robot',
-        description='the estimated disturbance as input, trained for robots that differ',
-        controller=_POLICY, parameters_file='params/rl_any.yaml',
-        policy_file='policies/rl_any.onnx'),
-    ControllerEntry(
-        name='rl_late', label='RL, late commands',
-        description='observes its last steps, trained with late commands',
-        controller=_POLICY, parameters_file='params/rl_late.yaml',
-        policy_file='policies/rl_late.onnx'),
-    ControllerEntry(
-        name='rl_published', label='RL, published training',
-        description='params/train_published.yaml, without guidance', controller=_POLICY,
-        parameters_file='params/rl_published.yaml', policy_file='policies/rl_published.onnx',
-        compared=True),
-    ControllerEntry(
-        name='nmpc_corrected', label='NMPC, corrected weight',
-        description='params/nmpc_published.yaml with weights.tilt 20 instead of 2',
-        controller=_NMPC, parameters_file='params/nmpc_corrected.yaml', flies_degraded=True,
-        compared=True),
-    ControllerEntry(
-        name='nmpc_published', label='NMPC, published settings',
-        description='params/nmpc_published.yaml', controller=_NMPC,
-        parameters_file='params/nmpc_published.yaml', flies_degraded=True, compared=True),
-    ControllerEntry(
-        name='hover', label='hover PD',
-        description="PD with allocation, the supervisor's fallback",
-        controller='beetle_omni_ros.control.hover:HoverController',
-        parameters_file='params/hover.yaml', flies_degraded=True))}
+SHIPPED: Mapping[str, ControllerEntry] = {
+    name: ControllerEntry(name=name, parameters_file=f'params/{name}.yaml', **fields)
+    for name, fields in schema.read_yaml(Path(__file__).with_name('controllers.yaml')).items()}
 DEFAULT = next(iter(SHIPPED))       # the default controller
 STANDING_BY = tuple(name for name, entry in SHIPPED.items() if entry.stands_by)
 COMPARED = sorted((name for name, entry in SHIPPED.items() if entry.compared),
                   key=lambda name: not SHIPPED[name].policy_file)      # policies first
-# Option of the command line -> controller whose file it replaces.
-OWNER = {entry.option: name for name, entry in SHIPPED.items() if entry.option}
+# Kind of a file -> controller for which programs accept another one.
+OWNER = {'parameters': 'nmpc', 'policy': 'rl'}
 _ADDED: dict[str, ControllerEntry] = {}     # of this process alone
 
 

@@ -98,47 +98,28 @@ WITH_WRENCHES = ('force', 'torque', 'wind', 'pushes')  # kinds of tasks
 
 @dataclass(frozen=True)
 class Segment:
-    """
-    Part of a task with constant disturbance.
+    """Part of a task with constant disturbance."""
 
-    Attributes:
-        duration: [s].
-        target: start time of the segment [s] -> target to publish; None: the target stays.
-        force_world: (3,) external force in world [N].
-        torque_body: (3,) external torque in base_link [N m].
-        payload: mass attached below the body [kg].
-        level: disturbance level of this segment [N, N m, m/s or kg] or number of a push, 0 for
-            none.
-
-    """
-
-    duration: float
+    duration: float         # [s]
+    # Start time of the segment [s] -> target to publish; None: the target stays.
     target: Callable[[float], Target] | None = None
-    force_world: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    torque_body: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    payload: float = 0.0
-    level: float = 0.0
+    force_world: np.ndarray = field(default_factory=lambda: np.zeros(3))    # external [N]
+    torque_body: np.ndarray = field(default_factory=lambda: np.zeros(3))    # in base_link [N m]
+    payload: float = 0.0    # mass attached below the body [kg]
+    level: float = 0.0      # of the disturbance [N, N m, m/s or kg], number of a push; 0: none
 
 
 @dataclass(frozen=True)
 class Task:
-    """
-    A named sequence of segments.
+    """A named sequence of segments."""
 
-    Attributes:
-        name: name or file given by the user.
-        kind: 'poses', 'trajectory', 'hover', 'force', 'torque', 'wind', 'pushes', 'payload' or
-            'steps'; it decides the metrics.
-        segments: segments in order.
-        poses: (P, 6) pose targets in order: x, y, z [m], roll, pitch, yaw [deg].
-        rounds: (start, end) of each round of a trajectory, since the task's start [s].
-
-    """
-
-    name: str
+    name: str       # or file given by the user
+    # 'poses', 'trajectory', 'hover', 'force', 'torque', 'wind', 'pushes', 'payload' or 'steps'; it
+    # decides the metrics.
     kind: str
-    segments: tuple[Segment, ...]
-    poses: np.ndarray
+    segments: tuple[Segment, ...]       # in order
+    poses: np.ndarray       # (P, 6) pose targets in order: x, y, z [m], roll, pitch, yaw [deg]
+    # (start, end) of each round of a trajectory, since the task's start [s].
     rounds: tuple[tuple[float, float], ...] = ()
 
     @property

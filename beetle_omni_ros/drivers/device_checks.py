@@ -13,8 +13,8 @@ import time
 import numpy as np
 
 from beetle_omni_ros.drivers import servo_xc330 as xc330
+from beetle_omni_ros.drivers.check import Findings, ObservedGraph
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
-from beetle_omni_ros.drivers.findings import Findings, ObservedGraph
 from beetle_omni_ros.drivers.mavlink import CONTRACT_VERSION, NO_HOST_HEARTBEAT
 from beetle_omni_ros.drivers.motor_board import MotorBoard
 from beetle_omni_ros.drivers.serial_port import SerialPortError, usb_ports
@@ -199,14 +199,7 @@ def check_board(parameters: MotorBoardParameters, robot: RobotParameters, second
 
 
 def _listen(board, seconds):
-    """
-    Poll the board.
-
-    Returns:
-        the newest battery and rotors, and a list of (number of packets sent, the board's counts)
-        for each report of the board's reception.
-
-    """
+    """Newest battery and rotors; packets sent, and the board's counts, at each report of these."""
     rotors = battery = None
     receptions = []
     started = time.monotonic()

@@ -12,21 +12,11 @@ import numpy as np
 
 from beetle_omni_ros.drivers import mavlink
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.mavlink import (
-    ArmCommand,
-    BOARD,
-    BoardState,
-    common,
-    HOST,
-    MavlinkReceiver,
-    restarted,
-    RotorStates,
-)
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 from beetle_omni_ros.model.mode import COMMAND_AGE, DISARMED, Mode, MOTORS_OFF
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.parts import ThrustMap
 from beetle_omni_ros.model.readings import BatteryReading
-from beetle_omni_ros.model.thrust_map import ThrustMap
 
 TICK = 0.01             # [s] longest sleep of the thread, a tenth of its shortest period
 CORRECTION = 50_000     # [us] a larger backward step of the board's clock is a restart
@@ -59,15 +49,15 @@ class MotorBoard:
         self._clock = clock
         self._lock = threading.Lock()           # of state and command
         self._write_lock = threading.Lock()     # of port and packer
-        self.state = BoardState(robot.battery.cells, parameters.silence, clock)
-        self._receiver = MavlinkReceiver(*BOARD, restarted)
-        self._packer = common.MAVLink(None, *HOST)
+        self.state = mavlink.BoardState(robot.battery.cells, parameters.silence, clock)
+        self._receiver = mavlink.MavlinkReceiver(*mavlink.BOARD, mavlink.restarted)
+        self._packer = mavlink.common.MAVLink(None, *mavlink.HOST)
         self.duty, self.saturated = np.zeros(4), np.zeros(4, dtype=bool)
         self._port: SerialPort | None = None
         self._thread: threading.Thread | None = None
         self._stopping = False
         self._counts = dict.fromkeys(('sent', 'buffer_full', 'connections'), 0)
-        self._command: ArmCommand | None = None
+        self._command: mavlink.ArmCommand | None = None
         self._next_heartbeat = self._next_timesync = 0.0
         self._last_stamp = (math.nan, 0)
 
@@ -112,11 +102,11 @@ class MotorBoard:
             return 'battery voltage unknown'
         return '' if state.clock.known else "offset of the board's clock unknown"
 
-    def start(self, arm: bool) -> ArmCommand:
+    def start(self, arm: bool) -> mavlink.ArmCommand:
         """Start to arm or disarm without waiting; the returned command gets the result."""
         missing = self.ready if arm else ''
         with self._lock:
-            command = ArmCommand(arm, self._write)
+            command = mavlink.ArmCommand(arm, self._write)
             if missing:
                 command.end(False, missing)
                 return command
@@ -141,8 +131,8 @@ class MotorBoard:
         # Without a measurement use the highest voltage, which gives the smallest duty.
         voltage = self.state.voltage or self.thrust_map.voltages[-1]
         duty = self.thrust_map.command(thrust, voltage)
-        if not self._write(common.MAVLink_set_actuator_control_target_message(
-                self._board_stamp(stamp, max(age, 0.0)), 0, *BOARD,
+        if not self._write(mavlink.common.MAVLink_set_actuator_control_target_message(
+                self._board_stamp(stamp, max(age, 0.0)), 0, *mavlink.BOARD,
                 [*duty.tolist(), 0.0, 0.0, 0.0, 0.0])):
             return 'port is away' if self._port is None else 'buffer full'
         self.duty, self.saturated = duty, self.thrust_map.saturated(thrust, voltage)
@@ -160,7 +150,7 @@ class MotorBoard:
         self._last_stamp = stamp, micros
         return micros
 
-    def poll(self) -> tuple[BatteryReading | None, RotorStates | None]:
+    def poll(self) -> tuple[BatteryReading | None, mavlink.RotorStates | None]:
         """Return battery and rotors since the last call."""
         with self._lock:
             return self.state.take()
@@ -228,12 +218,12 @@ class MotorBoard:
                     self._handle(message, now)
 
     def _handle(self, message, now):
-        if message.get_msgId() == common.MAVLINK_MSG_ID_COMMAND_ACK:
+        if message.get_msgId() == mavlink.common.MAVLINK_MSG_ID_COMMAND_ACK:
             if self._command:
                 self._command.acknowledge(message, self.state)
             return
         self.state.message(message, now)
-        if restarted(message):
+        if mavlink.restarted(message):
             self._next_heartbeat = self._next_timesync = now
 
     def _tick(self, now):
@@ -242,9 +232,9 @@ class MotorBoard:
                 self._command.tick(now)
         if now >= self._next_heartbeat:
             self._next_heartbeat = now + HEARTBEAT_PERIOD
-            self._write(common.MAVLink_heartbeat_message(
-                common.MAV_TYPE_ONBOARD_CONTROLLER, common.MAV_AUTOPILOT_INVALID, 0, 0,
-                common.MAV_STATE_ACTIVE, 3))
+            self._write(mavlink.common.MAVLink_heartbeat_message(
+                mavlink.common.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.common.MAV_AUTOPILOT_INVALID,
+                0, 0, mavlink.common.MAV_STATE_ACTIVE, 3))
         if now >= self._next_timesync:
             self._next_timesync = now + (TIMESYNC_PERIOD if self.state.clock.known
                                          else TIMESYNC_PERIOD_UNKNOWN)
@@ -265,7 +255,7 @@ class Arming:
     def __init__(self, board: MotorBoard):
         self.phase = RESTS
         self._board = board
-        self._command: ArmCommand | None = None
+        self._command: mavlink.ArmCommand | None = None
         self._supervisor = self._lost = self._silent = self._inhibited = ''
         self._missing_for = 0.0
         self._disarm = False        # whether a confirmation of disarming is pending

@@ -352,14 +352,11 @@ class ServoBus:
         servo.recovery = None
 
     def _recovery(self, servo, forced):
-        """
-        Read the state of a servo and recover it; yields after each transaction.
-
-        A restarted servo has lost gains, watchdog, torque and turn count. At the end it has
-        torque if the bus is enabled. With ``forced``, and after a shutdown, it is restarted; the
-        ping that it answers starts another recovery. So does a missing answer, as long as the
-        servo is not kept off.
-        """
+        """Read the state of a servo and recover it; yields after each transaction."""
+        # A restarted servo has lost gains, watchdog, torque and turn count. At the end it has
+        # torque if the bus is enabled. With ``forced``, and after a shutdown, it is restarted; the
+        # ping that it answers starts another recovery. So does a missing answer, as long as the
+        # servo is not kept off.
         link, identifier = self.link, servo.identifier
         if not forced:
             servo.error = link.read(identifier, xc330.HARDWARE_ERROR)

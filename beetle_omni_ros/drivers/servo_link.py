@@ -196,10 +196,7 @@ class ServoLink:
 
 
 def _fits(length, error, data):
-    """
-    Whether an answer may be that to a request of ``length`` bytes.
-
-    It does not contain its address. One of another length is a late one of another transaction,
-    whose CRC the SDK's readRx would return as data.
-    """
+    """Whether an answer may be that to a request of ``length`` bytes."""
+    # It does not contain its address. One of another length is a late one of another transaction,
+    # whose CRC the SDK's readRx would return as data.
     return len(data) == length or (not data and error & ~ALERT)

@@ -244,12 +244,9 @@ class ErrorStateEkf:
         return track is None and candidate is None
 
     def _corrected_with_doubt(self, track: Track, stamp, position, quaternion) -> bool:
-        """
-        Use a refused pose if the poses contradict the IMU but not each other.
-
-        Such poses continue smoothly from the last good one, and their residuals have the same
-        direction. The residuals of poses that are only noisy do not.
-        """
+        """Use a refused pose if the poses contradict the IMU but not each other."""
+        # Such poses continue smoothly from the last good one, and their residuals have the same
+        # direction. The residuals of poses that are only noisy do not.
         before, self._residual = self._residual, np.ravel(
             self._model.filter.y) / np.sqrt(np.diag(self._model.filter.R))
         lengths = float(np.linalg.norm(before) * np.linalg.norm(self._residual))

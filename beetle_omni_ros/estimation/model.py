@@ -294,11 +294,8 @@ class ErrorStateModel:
                 node.rate + age * trend)
 
     def _covariance_at_base(self, rotation, rate, covariance, lever: np.ndarray) -> np.ndarray:
-        """
-        Transform a covariance (15, 15) from the IMU: p = p_imu - R r, v = v_imu - R (w x r).
-
-        The noise of the rate w affects the velocity through the arm r.
-        """
+        """Transform a covariance (15, 15) from the IMU: p = p_imu - R r, v = v_imu - R (w x r)."""
+        # The noise of the rate w affects the velocity through the arm r.
         swing = rotations.cross(rate, lever)
         arm = rotation @ rotations.skew(lever)
         jacobian = np.eye(ERROR_STATES)

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from beetle_omni_ros.model import rotations
-from beetle_omni_ros.model.body import BodyState
+from beetle_omni_ros.model.rotations import BodyState
 
 # The 15 error states: position and velocity in world, attitude as rotation vector in base_link
 # (R_true = R exp(theta)), accelerometer and gyroscope bias. The offset between the sensors' clocks

@@ -57,7 +57,7 @@ def file_digest(path: str | Path) -> str:
 def code_fingerprint(file: str) -> str:
     """Digest of libraries, parameters, the folders FLOWN without pages, and a flying ``file``."""
     files = [path for folder in FLOWN for path in (SOURCE / folder).rglob('*')
-             if path.suffix in ('.py', '.c', '.h') and path not in PAGES]
+             if path.suffix in ('.py', '.c', '.h', '.yaml') and path not in PAGES]
     files += [Path(file), *share_path('params').glob('*.yaml')]
     return digest(platform.machine(), *map(str, versions().values()), *(
         part for path in sorted(files, key=lambda path: (path.parent.name, path.name))

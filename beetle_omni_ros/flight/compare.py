@@ -21,15 +21,8 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.control.tasks import make_task, Task
+from beetle_omni_ros.flight import campaign
 from beetle_omni_ros.flight import comparison_page as page
-from beetle_omni_ros.flight.campaign import (
-    file_digest,
-    flight_key,
-    policy_file,
-    Store,
-    sweep,
-    versions,
-)
 from beetle_omni_ros.flight.evaluate import fly
 from beetle_omni_ros.flight.summary import summarise
 from beetle_omni_ros.model.files import write_json, write_text
@@ -61,7 +54,8 @@ class ComparedFlight:
     seed: int           # of the task's poses and of the simulation
     policy: str = ''    # file in place of its shipped policy, '' for none
     spec: str = ''      # reference to its class, '' for a registered controller
-    plant: str = ''     # robot file of the simulated plant, '' for the shipped one
+    plant: str = ''     # robot file of the simulated plant, '' for that of ``robot``
+    robot: str = ''     # robot file of estimator and controller, '' for the shipped one
 
     @property
     def name(self) -> str:
@@ -72,9 +66,10 @@ class ComparedFlight:
     @property
     def key(self) -> str:
         """Digest of everything that determines its numbers."""
-        return flight_key(
+        return campaign.flight_key(
             fly_flight, self.reference, self.conditions, str(self.seed),
-            file_digest(self.task) if Path(self.task).is_file() else self.task,
+            campaign.file_digest(self.task) if Path(self.task).is_file() else self.task,
+            RobotParameters.load(self.robot).hash() if self.robot else '',
             policy=self.policy, plant=self.plant)
 
     @cached_property
@@ -104,7 +99,7 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
     for entry in conditions:
         if entry not in CONDITIONS:
             raise ParameterError(f"--conditions '{entry}': expected {' or '.join(CONDITIONS)}")
-    other = {registry.OWNER['--policy']: str(policy)} if policy else {}
+    other = {registry.OWNER['policy']: str(policy)} if policy else {}
     entries, flights = registry.find_all(controllers), []
     for task in tasks:
         duration = make_task(task).duration
@@ -126,7 +121,7 @@ def fly_flight(flight: ComparedFlight, task: Task) -> dict:
     start = time.process_time()
     result = {'failure': None, 'metrics': None, 'trace': {}, 'host': platform.node()}
     try:
-        robot = RobotParameters.load()
+        robot = RobotParameters.load(flight.robot or None)
         with warnings.catch_warnings():
             # An unstable flight may overflow; its metrics show the failure.
             warnings.simplefilter('ignore', RuntimeWarning)
@@ -206,12 +201,12 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
     flights = plan([entry.reference for entry in available], tasks or TASKS,
                    conditions or CONDITIONS, seeds, policy, plant)
     output = Path(output)
-    store = Store(cache or output / FLIGHTS)
+    store = campaign.Store(cache or output / FLIGHTS)
     try:
         output.mkdir(parents=True, exist_ok=True)
-        made = sweep(fly_flight, [(flight, flight.make_task()) for flight in flights],
-                     store=store, jobs=jobs, console=console,
-                     line=lambda flight, result, kept: f'{flight.name}: ' + (
+        made = campaign.sweep(fly_flight, [(flight, flight.make_task()) for flight in flights],
+                              store=store, jobs=jobs, console=console,
+                              line=lambda flight, result, kept: f'{flight.name}: ' + (
                          result['failure'] or ('kept' if kept else f"{result['cpu_s']:.0f} s")))
     except KeyboardInterrupt:
         print(f'beetle_omni: finished flights are kept in {store.folder}; the same command '
@@ -228,14 +223,11 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
 
 
 def _available(names, policy, refuse):
-    """
-    Build each controller once, which also fills the cache of compiled code for the workers.
-
-    Returns the entries that can fly with the text of their guidance, and the reason for each
-    other one. With ``refuse`` the first reason is raised instead.
-    """
+    """Build each controller once, which also fills the cache of compiled code for the workers."""
+    # Returns the entries that can fly with the text of their guidance, and the reason for each
+    # other one. With ``refuse`` the first reason is raised instead.
     robot, available, skipped = RobotParameters.load(), {}, {}
-    learnt = registry.OWNER['--policy']
+    learnt = registry.OWNER['policy']
     for entry in registry.find_all(names):
         try:
             available[entry] = guidance_of(entry.make(robot, ControllerOptions(
@@ -260,7 +252,7 @@ def results_of(flown: dict, tasks: Sequence[str], conditions: Sequence[str],
     order = {name: k for k, name in enumerate((*tasks, *conditions, *guidance))}
     flights = sorted(flown, key=lambda flight: (
         order[flight.task], order[flight.conditions], order[flight.controller], flight.seed))
-    files = {flight.controller: policy_file(flight.reference, flight.policy)
+    files = {flight.controller: campaign.policy_file(flight.reference, flight.policy)
              for flight in flights}
     return {
         'meta': {'version': __version__, 'commit': commit(),
@@ -270,10 +262,10 @@ def results_of(flown: dict, tasks: Sequence[str], conditions: Sequence[str],
                  'tasks': list(tasks), 'conditions': list(conditions),
                  'seeds': sorted({flight.seed for flight in flights}),
                  'plant': flights[0].plant,
-                 'policies': {name: f'{file.name} ({file_digest(file)})'
+                 'policies': {name: f'{file.name} ({campaign.file_digest(file)})'
                               for name, file in files.items() if file},
                  'cpu_s': sum(result.get('cpu_s', 0.0) for result in flown.values()),
-                 'processor': _processor(), 'versions': versions()},
+                 'processor': _processor(), 'versions': campaign.versions()},
         'summary': summarise({flight: flown[flight] for flight in flights}),
         'flights': [{'task': flight.task, 'conditions': flight.conditions,
                      'controller': flight.controller, 'seed': flight.seed,

@@ -12,19 +12,11 @@ from PIL import Image
 
 from beetle_omni_ros.bags.metrics import L_WINDOW, U_WINDOW
 from beetle_omni_ros.control.tasks import make_task, POSE_DURATION, RISING, TILTS
-from beetle_omni_ros.flight.summary import (
-    CONDITIONS,
-    kind_of,
-    look,
-    METRICS,
-    PRINTED,
-    printed,
-    PUBLISHED,
-    task_title,
-)
+from beetle_omni_ros.flight import summary
 from beetle_omni_ros.show import figures
 from beetle_omni_ros.show.figures import FAINT, INK, legend, panels
 from beetle_omni_ros.show.page import ABSENT, Grid, number
+from beetle_omni_ros.show.table import TEXTS
 
 # --- figures of the results of one task under one set of conditions ------------------------------
 
@@ -53,7 +45,7 @@ def convergence(groups: Groups, task: str) -> Figure:
     figure, axes = panels(1, 2, height=2.8)
     grid = np.arange(0.0, POSE_DURATION, STEP)
     for k, (name, results) in enumerate(groups.items()):     # the first is on top
-        style = look(name)
+        style = summary.look(name)
         for panel, (what, floor) in zip(axes[0], FLOOR.items(), strict=True):
             folded = _folded(results, f'{what}_error', grid)
             if not len(folded):
@@ -122,7 +114,7 @@ def _levels(panel, task):
 
 def _error_curve(panel, result, what, name, height):
     """Plot one flight's errors, mark lost control, and return the largest error."""
-    style, trace = look(name), result['trace']
+    style, trace = summary.look(name), result['trace']
     t, values = trace['t'], trace[f'{what}_error']
     panel.plot(t, values, color=style.colour, ls=style.dashes, lw=1.5, label=style.label,
                zorder=height)
@@ -150,52 +142,10 @@ DOTS = 180  # per inch
 COLOURS = 128  # of a picture; enough for thin lines with smooth edges
 TITLE = 'RL and NMPC under one architecture'
 COMPUTED = ('"0.3 on average"', '"typically within 10"')    # published times of a step
-TEXTS = {
-    'random': 'One pose after the other, 8 s each, x and y within 2 m, z from 0.6 to 2 m, any '
-              'attitude, upside down included.',
-    'waypoints': 'The five poses of the real-world experiment, 8 s each, three rounds.',
-    'lemniscate': 'Position, roll, pitch and yaw follow a figure of eight in space, five rounds; '
-                  'the policies were trained for poses, not for trajectories.',
-    'force': 'A vertical force that rises until control is lost.',
-    'torque': 'Torque impulses that rise until control is lost.',
-    'wind': 'A fan blows along x at 2, 3 and 4 m/s, with the turbulence of a jet.',
-    'pushes': 'A stick pushes from four sides, 10 N for 0.1 s.',
-    'payload': 'Masses attached while hovering, unknown to estimator and controllers.',
-    'hover': 'How still the robot stands, and how smooth its commands are.'}
-POSES = 'U: mean over 7.0 to 7.5 s of the 8 s of a pose; L: over 1.0 to 7.0 s. A crash ends a ' \
-        'flight; the later poses are not reached, and have no errors. Reached: U below 0.10 m ' \
-        'and 10 deg.'
-RISING_LEVELS = '{} along {} for {:g} s at each level, then {:g} s of rest, while hovering at ' \
-                '[0, 0, 1.5] m with 25 deg of roll. Lost: more than 1.5 m away, on the ground, ' \
-                'or turned by more than 90 deg when the next level is due. That ends the ' \
-                'flight. Never lost counts as one level more.'
-NOTES = {
-    'intervals': 'Cells: mean [95 % interval]; "of n" where fewer than the others flew to the '
-                 'end. Second lines: difference to the best mean, paired by seed{}. Bold: every '
-                 'difference to it excludes zero.',
-    'poses': POSES,
-    'random': f'{POSES} The published poses are drawn from the same ranges, not the same; whether '
-              'their |q* − q| counts the whole flight or the hover is not stated.',
-    'waypoints': f'{POSES} Ours is simulated, the published columns are measured on the real '
-                 'robot: not the same experiment. A value is the mean of a flight.',
-    'lemniscate_large': 'As the lemniscate, with 2.5 rad of roll and pitch.',
-    'lemniscate': 'Ours is simulated, the published columns are measured on the real robot. The '
-                  "curve is that of the authors' code. A value is the mean of a flight.",
-    **{name: RISING_LEVELS.format(kind.capitalize(), 'xyz'[int(np.flatnonzero(direction)[0]) % 3],
-                                 *times)
-       for name, (kind, direction, _, *times) in RISING.items()},
-    'wind': 'Errors from 2 s to 10 s at 4 m/s. The published columns are of the real robot.',
-    'pushes': 'Means over four pushes; not recovered counts as 5 s. The published columns are of '
-              'the real robot.',
-    'payload': 'Magnitudes of the mean over 7.0 to 7.5 s after the mass was attached. The '
-               'publication shows its real robot in a figure without numbers, with 1.0 kg for RL '
-               'only.',
-    'hover': 'At [0, 0, 1] m. Errors from 8 s to the end of 60 s; command changes from 7.0 to '
-             '7.5 s.',
-    'glance': 'Published numbers are of Gazebo, or of the real robot where marked with *; ours '
-              'are simulated. Bold as in the tables below, which have the intervals. CPU times: '
-              "everything for one command on one core, median of the flights' medians; the "
-              "published ones are of the robot's ARM board, that of RL of the inference alone."}
+NOTES = {**TEXTS['notes'], **{
+    name: TEXTS['notes']['rising'].format(
+        kind.capitalize(), 'xyz'[int(np.flatnonzero(direction)[0]) % 3], *times)
+    for name, (kind, direction, _, *times) in RISING.items()}}
 
 
 @dataclass(frozen=True)
@@ -232,12 +182,13 @@ def table(results: dict, task: str, conditions: str, brief: bool = False) -> Gri
     """Every metric of a task: mean with interval, unless brief also differences and ranges."""
     numbers = results['summary']['tasks'][task][conditions]
     ours = [name for name in results['meta']['controllers'] if name in numbers['flights']]
-    kind = kind_of(task)
-    paper = list(PUBLISHED) if kind in PRINTED else []
+    kind = summary.kind_of(task)
+    paper = list(summary.PUBLISHED) if kind in summary.PRINTED else []
     rows: list[list[str]] = []
     best: set[tuple[int, int]] = set()
-    for key, metric in METRICS[kind].items():
-        of, given = numbers['metrics'][key], [printed(task, metric, name) for name in paper]
+    for key, metric in summary.METRICS[kind].items():
+        of = numbers['metrics'][key]
+        given = [summary.printed(task, metric, name) for name in paper]
         most = max(of[name]['count'] for name in ours)
         best |= {(len(rows), column) for column, name in enumerate(ours, 1) if of[name]['best']}
         rows.append([metric.title, *(
@@ -264,11 +215,11 @@ def table(results: dict, task: str, conditions: str, brief: bool = False) -> Gri
                               len(numbers['flights'][name]['seeds'])) for name in ours),
             *(ABSENT for _ in paper)])
     seeds = sorted({seed for name in ours for seed in numbers['flights'][name]['seeds']})
-    real = 'real robot' if PRINTED.get(kind, (0, False))[1] else 'Gazebo'
+    real = 'real robot' if summary.PRINTED.get(kind, (0, False))[1] else 'Gazebo'
     return Grid(
-        f'{task_title(task)}, {conditions} conditions',
-        ['', *(look(name).label for name in ours),
-         *(f'{look(name).label} (published, {real})' for name in paper)],
+        f'{summary.task_title(task)}, {conditions} conditions',
+        ['', *(summary.look(name).label for name in ours),
+         *(f'{summary.look(name).label} (published, {real})' for name in paper)],
         rows, best=frozenset(best), faint_columns=frozenset(range(len(ours) + 1, len(rows[0]))),
         note=' '.join([f"Seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}.",
                        *([] if brief else [NOTES['intervals'].format(
@@ -281,17 +232,17 @@ def glance(results: dict) -> Grid:
     rows: list[list[str]] = []
     best = set()
     for task, by_conditions in results['summary']['tasks'].items():
-        real = ' *' * PRINTED.get(kind_of(task), (0, False))[1]
+        real = ' *' * summary.PRINTED.get(summary.kind_of(task), (0, False))[1]
         for conditions, numbers in by_conditions.items():
-            for key, metric in METRICS[kind_of(task)].items():
+            for key, metric in summary.METRICS[summary.kind_of(task)].items():
                 if not metric.glance:
                     continue
                 of = numbers['metrics'][key]
                 best |= {(len(rows), k) for k, name in enumerate(ours, 1)
                          if name in of and of[name]['best']}
-                given = [printed(task, metric, name) if conditions == 'nominal' else {}
-                         for name in PUBLISHED]
-                rows.append([f'{task_title(task)}, {conditions}: {metric.title}', *(
+                given = [summary.printed(task, metric, name) if conditions == 'nominal' else {}
+                         for name in summary.PUBLISHED]
+                rows.append([f'{summary.task_title(task)}, {conditions}: {metric.title}', *(
                     number(of[name]['mean'], metric.digits) if name in of else ABSENT
                     for name in ours), *(
                     number(entry.get('mean'), None) + real * bool(entry) for entry in given)])
@@ -299,10 +250,10 @@ def glance(results: dict) -> Grid:
         number(results['summary']['compute_ms'].get(name), 3) for name in ours),
         *(f'{text} *' for text in COMPUTED)])
     return Grid('All experiments', [
-        '', *(look(name).label for name in ours),
-        *(f'{look(name).label} (published)' for name in PUBLISHED)], rows, note=NOTES['glance'],
-        best=frozenset(best),
-        faint_columns=frozenset(range(len(ours) + 1, len(ours) + len(PUBLISHED) + 1)))
+        '', *(summary.look(name).label for name in ours),
+        *(f'{summary.look(name).label} (published)' for name in summary.PUBLISHED)], rows,
+        note=NOTES['glance'], best=frozenset(best),
+        faint_columns=frozenset(range(len(ours) + 1, len(ours) + len(summary.PUBLISHED) + 1)))
 
 
 def sections(results: dict, flown: dict) -> list[Section]:
@@ -321,12 +272,13 @@ def sections(results: dict, flown: dict) -> list[Section]:
             for conditions in by_conditions:
                 blocks.append(table(results, task, conditions))
                 groups = results_with_trace(flown, task, conditions)
-                for name, caption, draw in DRAWN.get(kind_of(task), ()):
+                for name, caption, draw in DRAWN.get(summary.kind_of(task), ()):
                     if groups and (figure := draw(groups, task)):
-                        blocks.append(Picture(f'{kind_of(task)}_{name}_{conditions}',
+                        blocks.append(Picture(f'{summary.kind_of(task)}_{name}_{conditions}',
                                               f'{caption} ({conditions} conditions)',
                                               png(figure)))
-            made.append(Section(task_title(task), TEXTS.get(kind_of(task), ''), blocks))
+            made.append(Section(summary.task_title(task),
+                                TEXTS['texts'].get(summary.kind_of(task), ''), blocks))
     return made
 
 
@@ -344,9 +296,9 @@ def content(results: dict, made: list[Section]) -> dict:
     meta = results['meta']
     terms = []
     for name in meta['controllers']:
-        what = look(name).text or meta['specs'].get(name, '')
-        terms.append((look(name).label, f"{what}; guidance: {meta['guidance'][name]}"))
-    terms += [(f'{name} conditions', CONDITIONS[name]) for name in meta['conditions']]
+        what = summary.look(name).text or meta['specs'].get(name, '')
+        terms.append((summary.look(name).label, f"{what}; guidance: {meta['guidance'][name]}"))
+    terms += [(f'{name} conditions', TEXTS['conditions'][name]) for name in meta['conditions']]
     terms += [(f'{name}: not flown', reason) for name, reason in meta['skipped'].items()]
     failed = sum(bool(flight['failure']) for flight in results['flights'])
     facts = [f"beetle_omni_ros {meta['version']}"
@@ -355,7 +307,7 @@ def content(results: dict, made: list[Section]) -> dict:
              f"{', '.join(map(str, meta['seeds']))}",
              f"{meta['cpu_s'] / 60:.1f} core minutes on {meta['processor']}",
              *([f"simulated plant: {meta['plant']}"] if meta['plant'] else []),
-             *(f'{look(name).label}: policy {digest}'
+             *(f'{summary.look(name).label}: policy {digest}'
                for name, digest in meta['policies'].items())]
     flights = Grid('', ['task', 'conditions', 'controller', 'seed', 'end', 'core s'], [
         [flight['task'], flight['conditions'], flight['controller'], str(flight['seed']),

@@ -78,23 +78,13 @@ class Distribution:
 
 @dataclass
 class Input:
-    """
-    One topic that a component reads, with counts of its messages.
+    """One topic that a component reads, with counts of its messages."""
 
-    Attributes:
-        handle: called with each accepted value, of a target also with its time of publication.
-        expected: whether the end of the messages is an error.
-        max_age: limit of the age of a stamp [s], which also refuses future stamps, or None.
-        stamped: whether its values have stamps; a text has none, and is not counted.
-        qos: quality of service that replaces that of the table of topics, or None.
-
-    """
-
-    handle: Callable[..., Any]
-    expected: bool = True
-    max_age: float | None = None
-    stamped: bool = True
-    qos: Qos | None = None
+    handle: Callable[..., Any]      # of an accepted value, of a target also its publication time
+    expected: bool = True           # whether the end of the messages is an error
+    max_age: float | None = None    # limit of the age of a stamp [s]; also refuses future stamps
+    stamped: bool = True            # a text has no stamp, and is not counted
+    qos: Qos | None = None          # quality of service in place of that of the table of topics
     received: int = 0
     reported: int = 0
     age: float = float('nan')
@@ -111,21 +101,12 @@ class Input:
 
 @dataclass
 class Timer:
-    """
-    A periodic call.
+    """A periodic call."""
 
-    Attributes:
-        period: [s].
-        call: called in each period.
-        steady: whether the steady clock counts, also if simulated time stands still.
-        reset: begins a new period; set by the host.
-
-    """
-
-    period: float
+    period: float               # [s]
     call: Callable[[], None]
-    steady: bool = False
-    reset: Callable[[], None] = lambda: None
+    steady: bool = False        # whether the steady clock counts, also if simulated time stands
+    reset: Callable[[], None] = lambda: None    # begins a new period; set by the host
 
 
 class Host(Protocol):
@@ -273,12 +254,9 @@ class Component:
         self._identity = identity
 
     def _check_source(self, source):
-        """
-        Refuse commands of a second publisher.
-
-        Until a supervisor publishes its identity, every command is accepted; after that, only
-        those with the newest identity.
-        """
+        """Refuse commands of a second publisher."""
+        # Until a supervisor publishes its identity, every command is accepted; after that, only
+        # those with the newest identity.
         identity = self._identity
         if identity and source != identity:
             name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'

@@ -13,35 +13,15 @@ from rich.console import Console
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
+from beetle_omni_ros.flight import fault_flights as flights
 from beetle_omni_ros.flight.campaign import file_digest, Store, sweep
-from beetle_omni_ros.flight.fault_flights import (
-    ALL_STARTS,
-    CONDITIONS,
-    FaultFlight,
-    fly_case,
-    HEALTHY,
-    LANDING,
-    LANDING_BLIND,
-    PLAN,
-    STARTS,
-)
+from beetle_omni_ros.flight.fault_flights import PLAN
 from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import commit
 from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.show import page
 from beetle_omni_ros.show.figures import AMBER, GREEN, RED
-from beetle_omni_ros.show.page import (
-    ABSENT,
-    Grid,
-    html,
-    markdown,
-    number,
-    page,
-    print_end,
-    print_grids,
-    section,
-    verdict_head,
-)
 from beetle_omni_ros.sim.faults import Case, chosen, load_cases
 
 # --- page ----------------------------------------------------------------------------------------
@@ -110,21 +90,23 @@ def _row(flown, cases):
         'hours': sum(known('flown_s')) / 3600, 'alarms': dict(alarms.most_common())}
 
 
-def grid(results: dict, narrow: bool = False) -> Grid:
+def grid(results: dict, narrow: bool = False) -> page.Grid:
     """Table of the summary; ``narrow``: for 80 columns. Columns without content are left out."""
     rows = results['summary']['faults']
     cells = [[
         name, row['expected'], f"{row['good']}/{row['flights']}",
-        _counted(row['outcomes'], '\n' if narrow else ', '), number(row['impact_worst_m_s']),
-        number(row['inclination_worst_deg']), number(row['named_s']), _counted(row['alarms']),
-        *([] if narrow else [number(row['impact_median_m_s']), row['what']])]
+        _counted(row['outcomes'], '\n' if narrow else ', '), page.number(row['impact_worst_m_s']),
+        page.number(row['inclination_worst_deg']), page.number(row['named_s']),
+        _counted(row['alarms']),
+        *([] if narrow else [page.number(row['impact_median_m_s']), row['what']])]
         for name, row in rows.items()]
     header = ['fault', 'expected', 'good', 'outcomes', 'impact worst [m/s]',
               'inclination worst [deg]', 'named [s]', 'alarms', 'impact median [m/s]',
               'what happens']
-    shown = [k for k in range(len(cells[0])) if any(row[k] not in ('', ABSENT) for row in cells)]
-    return Grid('', [header[k] for k in shown], [[row[k] for k in shown] for row in cells],
-                note=NOTE)
+    shown = [k for k in range(len(cells[0]))
+             if any(row[k] not in ('', page.ABSENT) for row in cells)]
+    return page.Grid('', [header[k] for k in shown], [[row[k] for k in shown] for row in cells],
+                     note=NOTE)
 
 
 def total_text(results: dict) -> str:
@@ -138,7 +120,7 @@ def total_text(results: dict) -> str:
 def as_markdown(results: dict) -> str:
     """All results as Markdown."""
     return (f"# Faults\n\n{results['meta']['command']}\n\n{total_text(results)}\n\n"
-            + markdown(grid(results)))
+            + page.markdown(grid(results)))
 
 
 def as_page(results: dict, folder: Path | None = None) -> str:
@@ -151,23 +133,23 @@ def as_page(results: dict, folder: Path | None = None) -> str:
     bags = f'Page of one flight: beetle_omni report {folder}/bags/BAG --output flight.html' \
         if any(one['bag'] for one in flights) else ''
     bad = [one for one in flights if not one['good']]
-    return page(
+    return page.page(
         'Faults', ' · '.join(made), [grid(results)],
         [f'{name}: {text}' for name, text in OUTCOMES.items()],
-        [*([section('Flights that did not end as expected', '', html(_flights(bad)))]
-           if bad else []), section('Each flight', bags, html(_flights(flights)))],
-        verdict_head(f"{total['good']} of {total['flights']} as expected", colour,
-                     total_text(results)))
+        [*([page.section('Flights that did not end as expected', '', page.html(_flights(bad)))]
+           if bad else []), page.section('Each flight', bags, page.html(_flights(flights)))],
+        page.verdict_head(f"{total['good']} of {total['flights']} as expected", colour,
+                          total_text(results)))
 
 
 def _flights(flights):
     """Table with one row for each flight."""
-    return Grid('', ['fault', 'from', 'seed', 'conditions', 'expected', 'outcome', 'impact [m/s]',
-                     'first message', 'bag'], [
-        [*(str(one.get(key, ABSENT)) for key in (
+    return page.Grid('', ['fault', 'from', 'seed', 'conditions', 'expected', 'outcome',
+                          'impact [m/s]', 'first message', 'bag'], [
+        [*(str(one.get(key, page.ABSENT)) for key in (
             'case', 'start', 'seed', 'conditions', 'expected', 'outcome')),
-         number(one.get('impact_m_s')), one.get('said') or one['error'] or ABSENT,
-         one['bag'] or ABSENT] for one in flights])
+         page.number(one.get('impact_m_s')), one.get('said') or one['error'] or page.ABSENT,
+         one['bag'] or page.ABSENT] for one in flights])
 
 
 def _counted(counts, between=', '):
@@ -197,26 +179,27 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     struck = chosen(cases, only or list(cases))
     entry = registry.find(controller)
     for start in starts or ():
-        if start not in ALL_STARTS:
-            raise ParameterError(f"--from '{start}': expected {', '.join(ALL_STARTS)}")
+        if start not in flights.ALL_STARTS:
+            raise ParameterError(f"--from '{start}': expected {', '.join(flights.ALL_STARTS)}")
     if bags and output is None:
         raise ParameterError('--bags: expected --output DIR to record to')
     RobotParameters.load(plant)
     guidance = guidance_of(entry.make(RobotParameters.load()))  # refuses an unusable controller
     common = {'controller': entry.reference, 'plant': str(plant or ''),
               'listed': file_digest(faults) if faults else ''}
-    under, begins, count = (conditions,), starts or STARTS, seeds
+    under, begins, count = (conditions,), starts or flights.STARTS, seeds
     if landings:
-        struck, begins, count = [LANDING_BLIND if without_mocap else LANDING], ('',), landings
+        struck = [flights.LANDING_BLIND if without_mocap else flights.LANDING]
+        begins, count = ('',), landings
     elif healthy:
-        struck, begins, under = [HEALTHY], ('',), CONDITIONS
+        struck, begins, under = [flights.HEALTHY], ('',), flights.CONDITIONS
         count = ceil(3600 * healthy / PLAN.healthy_time)
     folder = output / 'bags' if bags else None
-    calls = [(FaultFlight(case.name, start, k, name, **common), case, folder)
+    calls = [(flights.FaultFlight(case.name, start, k, name, **common), case, folder)
              for case in struck for start in begins for name in under
              for k in range(seed, seed + count)]
     store = Store(output / FLIGHTS) if output else None
-    flown = sweep(fly_case, calls, store=None if bags else store, jobs=jobs,
+    flown = sweep(flights.fly_case, calls, store=None if bags else store, jobs=jobs,
                   console=console)      # a stored flight records no bag
     results = {'meta': {
         'command': shlex.join(['beetle_omni', *sys.argv[1:]]), 'version': __version__,
@@ -228,8 +211,9 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
         write_json(output / 'faults.json', results)
         write_text(output / PAGE, as_page(results, output), 'page')
         write_text(output / 'faults.md', as_markdown(results), 'page')
-    print_grids([grid(results, narrow=True)], console)
+    page.print_grids([grid(results, narrow=True)], console)
     console.print(total_text(results), highlight=False, markup=False, soft_wrap=True)
-    print_end(console, [output and output / PAGE, json_path], f'open {output / PAGE} in a browser'
-              if output else 'the same with --output DIR writes a page')
+    page.print_end(console, [output and output / PAGE, json_path],
+                   f'open {output / PAGE} in a browser' if output else
+                   'the same with --output DIR writes a page')
     return results

@@ -1,18 +1,14 @@
 """Flights with a corrected robot file beside those with the file before."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
-from beetle_omni_ros.bags.metrics import metrics
-from beetle_omni_ros.control.tasks import make_task
-from beetle_omni_ros.flight.campaign import file_digest, flight_key, Store, sweep
-from beetle_omni_ros.flight.evaluate import fly
-from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.flight.campaign import Store, sweep
+from beetle_omni_ros.flight.compare import ComparedFlight, fly_flight
+from beetle_omni_ros.model.schema import RunError
 from beetle_omni_ros.show.page import Grid, number
 
 FILES = 'before', 'after'
@@ -25,42 +21,6 @@ WORSE = 0.05        # [1] increase of an error with which a file is not recommen
 CERTAIN = 1.645     # standard errors of the mean: 95 %, one-sided
 
 
-@dataclass(frozen=True)
-class FileFlight:
-    """A flight of a controller with one of the two robot files."""
-
-    controller: str
-    file: str           # of FILES
-    robot: str          # '': the shipped one
-    plant: str
-    task: str
-    seed: int
-    cost: float = 1.0
-
-    @property
-    def name(self) -> str:
-        """Name of the stored result."""
-        return f'{self.controller} {self.file} {Path(self.task).stem} {self.seed}'
-
-    @cached_property
-    def key(self) -> str:
-        """Digest of all that decides the result."""
-        task = file_digest(self.task) if Path(self.task).is_file() else self.task
-        robot = RobotParameters.load(self.robot).hash() if self.robot else ''
-        return flight_key(fly_file, self.controller, robot, task, str(self.seed),
-                          plant=self.plant)
-
-
-def fly_file(flight: FileFlight) -> dict:
-    """Reached poses and errors of each pose of a flight."""
-    task = make_task(flight.task, flight.seed)
-    result = metrics(fly(flight.controller, task, seed=flight.seed,
-                         robot=RobotParameters.load(flight.robot or None),
-                         plant=RobotParameters.load(flight.plant)), task)
-    return {'crashed': result['crashed'], 'poses': [
-        {key: pose[key] for key in ('reached', *ERRORS)} for pose in result['poses']]}
-
-
 def before_and_after(robot: Path | None, corrected: Path, plant: Path | None,
                      controllers: Sequence[str], task: str, seeds: Sequence[int],
                      folder: Path, jobs: int | None = None,
@@ -68,16 +28,8 @@ def before_and_after(robot: Path | None, corrected: Path, plant: Path | None,
     """
     Fly controllers with a robot file and with the corrected one on the same plant.
 
-    Args:
-        robot: robot file before; None: the shipped one.
-        corrected: robot file after.
-        plant: true robot of the simulation; None: ``corrected``.
-        controllers: names.
-        task: task of every flight.
-        seeds: of task and simulation; one flight for each.
-        folder: keeps finished flights, so that a repeated call flies the rest.
-        jobs: parallel flights; None: one on each core.
-        console: for progress.
+    Arguments are as of `beetle_omni improve`; one flight for each of ``seeds``. ``folder`` keeps
+    finished flights, so that a repeated call flies the rest.
 
     Returns:
         controller -> 'before' and 'after' with reached, poses and the means of ``ERRORS``,
@@ -85,15 +37,17 @@ def before_and_after(robot: Path | None, corrected: Path, plant: Path | None,
         certainty, by the differences of the poses, and 'better': none is, and no pose is lost.
 
     """
-    files = dict(zip(FILES, (str(robot or ''), str(corrected)), strict=True))
-    flights = [FileFlight(name, file, path, str(plant or corrected), task, seed)
-               for seed in seeds for name in controllers for file, path in files.items()]
-    flown = sweep(fly_file, [(flight,) for flight in flights], store=Store(folder), jobs=jobs,
-                  console=console)
-    return {name: compared({file: [
-        pose for flight, result in zip(flights, flown, strict=True)
-        if (flight.controller, flight.file) == (name, file) for pose in result['poses']]
-        for file in FILES}) for name in controllers}
+    poses: dict[str, dict[str, list]] = {name: {} for name in controllers}
+    for file, path in zip(FILES, (str(robot or ''), str(corrected)), strict=True):
+        flights = [ComparedFlight(task, 'nominal', name, seed, plant=str(plant or corrected),
+                                  robot=path) for seed in seeds for name in controllers]
+        flown = sweep(fly_flight, [(flight, flight.make_task()) for flight in flights],
+                      store=Store(folder / file), jobs=jobs, console=console)
+        for flight, result in zip(flights, flown, strict=True):
+            if result['failure']:
+                raise RunError(f"{flight.name}: {result['failure']}")
+            poses[flight.controller].setdefault(file, []).extend(result['metrics']['poses'])
+    return {name: compared(each) for name, each in poses.items()}
 
 
 def compared(poses: dict[str, list[dict]]) -> dict:

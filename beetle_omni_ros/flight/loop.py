@@ -22,11 +22,11 @@ from beetle_omni_ros.control.base import Controller, PoseTarget, Target
 from beetle_omni_ros.control.tasks import Task
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight.component import Component, DIAGNOSTICS_PERIOD, Timer
-from beetle_omni_ros.flight.process_faults import ProcessFaults
 from beetle_omni_ros.flight.stack import (
     CANNOT_BE_FLOWN,
     ControllerComponent,
     Estimator,
+    ProcessFaults,
     SupervisorComponent,
 )
 from beetle_omni_ros.flight.surroundings import DONE, SimulatedRobot, TaskReference, WAITING

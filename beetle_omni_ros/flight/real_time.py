@@ -10,7 +10,7 @@ from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, Serv
 from beetle_omni_ros.flight.bridges import ACTIVE, Bridge, JointBridge, RotorBridge
 from beetle_omni_ros.flight.loop import FlightLoop
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
+from beetle_omni_ros.sim.emulated.device import EmulatedActuators
 from beetle_omni_ros.sim.faults import DEVICES
 
 WAIT = 0.0005           # [s] between looks for messages of the drivers' threads

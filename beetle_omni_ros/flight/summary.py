@@ -18,8 +18,9 @@ from scipy.special import ndtr, stdtrit
 from beetle_omni_ros.bags.metrics import at, CRASHED, failed, POSE_KEYS
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.tasks import PUSH_PERIOD, RISING, TILTS
-from beetle_omni_ros.show import table as published
 from beetle_omni_ros.show.figures import line_of
+from beetle_omni_ros.show.table import PUBLISHED as published
+from beetle_omni_ros.show.table import TEXTS
 
 # --- statistics ----------------------------------------------------------------------------------
 
@@ -90,25 +91,14 @@ def compared(samples: Mapping[str, Sample], more: bool = False) -> dict[str, dic
 # --- metrics -------------------------------------------------------------------------------------
 
 PREFIX = 'published_'    # prefix of a controller in the publication
-CONDITIONS = {
-    'nominal': 'simulator as measured: multibody plant, second-order servos, rotor lag, sensor '
-               'noise, every delay, state estimation by the EKF',
-    'published': "the same with the publication's randomisation, drawn from the seed: mass, "
-                 'inertia, centre of mass, sensor biases, more noise, latencies',
-}
 # Column of the publication's numbers -> its name there.
 PUBLISHED = {f'{PREFIX}{name}': entry.label for name, entry in reversed(
-    registry.SHIPPED.items()) if entry.label in published.RANDOM_POSES}
+    registry.SHIPPED.items()) if entry.label in published['random']}
 # Kind of a task -> published numbers, and whether they are of the real robot.
 PRINTED: dict[str, tuple[dict, bool]] = {
-    'random': (published.RANDOM_POSES, False), 'waypoints': (published.WAYPOINTS, True),
-    'lemniscate': (published.LEMNISCATE, True), 'wind': (published.WIND, True),
-    'pushes': (published.PUSHED, True), **dict.fromkeys(RISING, (published.DISTURBANCE, False))}
-TITLES = {'waypoints': 'Five waypoints', 'lemniscate': '3D lemniscate',
-          'lemniscate_large': 'Large 3D lemniscate', 'force': 'Force disturbance',
-          'torque': 'Torque disturbance', 'force_down': 'Force downwards',
-          'force_up': 'Force upwards', 'torque_pulses': 'Torque pulses', 'wind': 'Fan',
-          'pushes': 'Stick pushes', 'payload': 'Payload', 'hover': 'Steady hover'}
+    'random': (published['random'], False), **dict.fromkeys(
+        RISING, (published['disturbance'], False)), **{
+        kind: (published[kind], True) for kind in ('waypoints', 'lemniscate', 'wind', 'pushes')}}
 
 
 @dataclass(frozen=True)
@@ -135,36 +125,25 @@ def look(controller: str) -> Look:
 
 def kind_of(task: str) -> str:
     """Kind of a task: 'random', 'poses' for a pose file, or its name."""
-    return task if task in TITLES else 'random' if task[6:].isdigit() else 'poses'
+    return task if task in TEXTS['titles'] else 'random' if task[6:].isdigit() else 'poses'
 
 
 def task_title(task: str) -> str:
     """Heading of a task."""
-    return TITLES.get(task) or (f'{task[6:]} random poses' if kind_of(task) == 'random'
+    return TEXTS['titles'].get(task) or (f'{task[6:]} random poses' if kind_of(task) == 'random'
                                 else f'Poses of {Path(task).name}')
 
 
 @dataclass(frozen=True)
 class Metric:
-    """
-    A number that a flight has once, or once for each pose.
+    """A number that a flight has once, or once for each pose."""
 
-    Attributes:
-        title: its name with the unit.
-        digits: displayed digits.
-        of: path in the metrics of a flight, or function of them.
-        printed: path of the published mean.
-        more: whether more is better.
-        glance: whether it is in the table of all experiments.
-
-    """
-
-    title: str
-    digits: int
-    of: str | Callable[[dict], Any]
-    printed: str = ''
-    more: bool = False
-    glance: bool = False
+    title: str              # its name with the unit
+    digits: int             # displayed digits
+    of: str | Callable[[dict], Any]     # path in the metrics of a flight, or function of them
+    printed: str = ''       # path of the published mean
+    more: bool = False      # whether more is better
+    glance: bool = False    # whether it is in the table of all experiments
 
     def value(self, judged: dict) -> Any:
         """Return the number of a flight, or the list of those of its poses."""

@@ -12,7 +12,7 @@ from beetle_omni_ros.control.tasks import Task, TaskPlayer, WITH_WRENCHES
 from beetle_omni_ros.flight.component import Component, Distribution, ERROR, OK, WARN
 from beetle_omni_ros.model.mode import COMMAND_AGE, FLYING, LANDING
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
+from beetle_omni_ros.sim.emulated.device import EmulatedActuators
 from beetle_omni_ros.sim.sensors import Frame
 from beetle_omni_ros.sim.simulator import Simulator
 from beetle_omni_ros.supervisor.interface import INFO

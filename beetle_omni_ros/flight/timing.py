@@ -11,7 +11,7 @@ from beetle_omni_ros.bags.log import FlightLog, hold
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, ControllerHost, State
 from beetle_omni_ros.control.tasks import make_task
-from beetle_omni_ros.drivers.findings import Findings
+from beetle_omni_ros.drivers.check import Findings
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight.evaluate import fly

@@ -8,6 +8,7 @@ by naming it; the place of action follows from its kind, see :attr:`Effect.kind`
 import casadi as ca
 import numpy as np
 
+from beetle_omni_ros.model import formula
 from beetle_omni_ros.model.schema import numbers, ParameterError, quoted, unknown
 from beetle_omni_ros.model.terms import Effect, EffectParameter, NAN
 
@@ -248,6 +249,12 @@ CATALOGUE: dict[str, Effect] = {
         'rotor', {'exponent': EffectParameter('1', 0.0, -1.0, 5.0)},
         'f = f* (V / V_full)^k: thrust of a thrust map without voltage; 6.9 %/V on this '
         "robot's map", voltage_sag, measured=('voltage_ratio',)),
+    'formula': Effect(
+        'body', {'expressions': EffectParameter('', ('force: velocity',), 0, 0, form=True,
+                                                text=True),
+                 'coefficients': EffectParameter('SI', (0.0,), -1e6, 1e6)},
+        'sum of terms k a b c, which a file lists: gap --learn writes one', formula.apply,
+        each='term'),
     'rotor_lag': Effect(
         'rotor', {'time_constant': _number('rotors.time_constant', 's', 0.001, 2.0)},
         "T f' + f = f*"),
@@ -347,11 +354,21 @@ def validated(effects: dict) -> dict[str, dict]:
                                  f'found {quoted(given)}')
         checked[name] = {key: _value(f'effects.{name}.{key}', spec, given.get(key, spec.default))
                          for key, spec in entry.parameters.items()}
+        if entry.each == 'term' and len({len(value) for value in checked[name].values()}) > 1:
+            raise ParameterError(f'effects.{name}: expected one coefficient for each expression')
     return checked
 
 
 def _value(at, spec, value):
+    if spec.text:
+        if not isinstance(value, (list, tuple)) or not value:
+            raise ParameterError(f'{at}: expected a list of expressions, found {quoted(value)}')
+        for term in value:
+            formula.parsed(term)
+        return tuple(value)
     array, shape = numbers(value, at, vars(spec)), np.shape(spec.neutral)
+    if shape == (1,) and array.ndim == 1:     # of each term
+        shape = array.shape
     if spec.of_each and array.shape == (4,):
         shape = array.shape
     if array.shape != shape:

@@ -27,6 +27,8 @@ from beetle_omni_ros.model.terms import SensorErrors
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
 ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
 TILT_LAG = 'tilt_lag'   # interval of a property; the logs determine it better than its parts
+# What the file of one effect has beside its parameters.
+EFFECT_NOTES = 'units', 'intervals', 'source'
 DRAWS = 1000            # of a robot with such a lag, of which the logs allow a fifth
 
 
@@ -220,6 +222,11 @@ def find_robot(name: str | Path, seen: tuple[Path, ...] = ()) -> Path:
 def _merged(path: Path, seen: tuple[Path, ...] = ()) -> dict:
     """Content of a robot file, merged with the file that it extends."""
     content = schema.load_yaml(path)
+    if isinstance(effects := content.get('effects'), dict):
+        content['effects'] = {name: {    # text is the path of a file of one effect
+            key: own for key, own in schema.load_yaml(path.parent / value).items()
+            if key not in EFFECT_NOTES} if isinstance(value, str) else value
+            for name, value in effects.items()}
     if 'extends' not in content:
         return content
     name, seen = content.pop('extends'), (*seen, path.resolve())

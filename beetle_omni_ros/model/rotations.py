@@ -6,6 +6,7 @@ times as long. For a few numbers ``ndarray.dot`` takes a third of the time of ``
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import atan2, cos, sin, sqrt
 from typing import Any
 
@@ -117,3 +118,14 @@ def to_rpy(quaternion: Vector) -> np.ndarray:
     return np.array([atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
                      atan2(sin_pitch, sqrt(max(0.0, 1 - sin_pitch * sin_pitch))),
                      atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))])
+
+
+@dataclass(slots=True, eq=False)
+class BodyState:
+    """Pose and velocities of base_link at one moment."""
+
+    stamp: float                    # time [s]
+    position: np.ndarray            # (3,) in world [m]
+    velocity: np.ndarray            # (3,) in world [m/s]
+    quaternion: np.ndarray          # (4,) body to world, (x, y, z, w), unit
+    angular_velocity: np.ndarray    # (3,) in base_link [rad/s]

@@ -76,7 +76,8 @@ class EffectParameter:
     """One number, or vector, of an effect; SI units."""
 
     unit: str
-    neutral: float | tuple[float, ...]      # without effect; NaN: the robot file's own number
+    # without effect; NaN: the robot file's own number; of text: an example
+    neutral: float | tuple[float, ...] | tuple[str, ...]
     low: float                              # smallest and largest legal value
     high: float
     default: float | tuple[float, ...] | None = None    # if a file omits it; None: it is required
@@ -84,6 +85,7 @@ class EffectParameter:
     number: str = ''        # dotted key of the robot file's number that it replaces
     sensor: str = ''        # field of SensorErrors that it sets
     form: bool = False      # it only chooses a form of the effect and is not fitted
+    text: bool = False      # it is a list of expressions, see :mod:`model.formula`
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ class Effect:
     apply: Callable | None = None
     # Equation of a joint effect, which changes ServoTerms: servo(terms, joint, **values).
     servo: Callable | None = None
-    each: str = ''      # 'rotor' or 'joint' if the parameters are (4,), one for each
+    each: str = ''      # 'rotor' or 'joint' if parameters are (4,), 'term': one each expression
     # Delayed quantities: 'tilt' and 'thrust' commands, readings of 'imu', 'mocap', 'encoders'.
     delays: tuple[str, ...] = ()
     allocated: bool = False     # the allocation includes it

@@ -7,18 +7,10 @@ from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_xc330 import ServoBusError
-from beetle_omni_ros.flight.bridges import (
-    ACTIVE,
-    Bridge,
-    INACTIVE,
-    JointBridge,
-    RotorBridge,
-    UNCONFIGURED,
-)
+from beetle_omni_ros.flight import bridges
 from beetle_omni_ros.model.schema import parameter
-from beetle_omni_ros.ros import parameters
 from beetle_omni_ros.ros.graph import AUTOSTART
-from beetle_omni_ros.ros.node import FlightNode
+from beetle_omni_ros.ros.node import file_parameter, FlightNode
 
 RETRY = 1.0             # [s] between attempts to start by itself
 
@@ -31,11 +23,11 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
     ``refusal`` of the bridge, and the state stays as it was.
     """
 
-    component: Bridge
+    component: bridges.Bridge
 
     def __init__(self, name, *args, autostart):
         FlightNode.__init__(
-            self, name, *args, robot_file=parameters.file_parameter(), autostart=parameter(
+            self, name, *args, robot_file=file_parameter(), autostart=parameter(
                 autostart, choices=tuple(AUTOSTART),
                 doc='transition at the start, repeated until it succeeds'))
         LifecycleNodeMixin.__init__(self)
@@ -66,11 +58,11 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
     def try_to_start(self) -> None:
         """Make the next transitions of the automatic start."""
         self._starts, goal = True, AUTOSTART[self.parameters.autostart]
-        if self.stage == UNCONFIGURED:
+        if self.stage == bridges.UNCONFIGURED:
             self.trigger_configure()
-        if self.stage == INACTIVE and goal == ACTIVE:
+        if self.stage == bridges.INACTIVE and goal == bridges.ACTIVE:
             self.trigger_activate()
-        if self.stage not in (UNCONFIGURED, INACTIVE) or self.stage == goal:
+        if self.stage not in (bridges.UNCONFIGURED, bridges.INACTIVE) or self.stage == goal:
             self._start_timer.cancel()
         self._starts = False
         self._changed()
@@ -130,7 +122,7 @@ class JointBridgeNode(BridgeNode):
     def __init__(self):
         super().__init__('joint_bridge_node', ServoBusParameters, 'params/servo_bus.yaml',
                          'servo_bus_file', autostart='none')
-        self.run(JointBridge(self.parameters, self.robot))
+        self.run(bridges.JointBridge(self.parameters, self.robot))
 
 
 class RotorBridgeNode(BridgeNode):
@@ -139,4 +131,4 @@ class RotorBridgeNode(BridgeNode):
     def __init__(self):
         super().__init__('rotor_bridge_node', MotorBoardParameters, 'params/motor_board.yaml',
                          'motor_board_file', autostart='activate')
-        self.run(RotorBridge(self.parameters, self.robot))
+        self.run(bridges.RotorBridge(self.parameters, self.robot))

@@ -17,8 +17,8 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.control.targets import TargetChecks
 from beetle_omni_ros.model import rotations
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.rotations import BodyState
 from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.ros import drive, wire
 from beetle_omni_ros.ros.drive import Action, DriveParameters, Steering

@@ -1,24 +1,28 @@
 """`beetle_omni fly`: fly the ROS graph, record a bag, and print the results from the bag."""
 
-from collections.abc import Callable, Sequence
-from contextlib import contextmanager, ExitStack
+from collections.abc import Callable
+from contextlib import contextmanager, ExitStack, suppress
 from functools import partial
+import os
 from pathlib import Path
+from statistics import median
 import subprocess
 import sys
 import tempfile
+import time
 
 from rich.console import Console
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.bags.bag_writer import add_meta, check_new
-from beetle_omni_ros.bags.log import motion
+from beetle_omni_ros.bags.log import motion, Recorder
 from beetle_omni_ros.bags.metrics import failed, metrics
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.control.tasks import make_task, Task
-from beetle_omni_ros.flight.component import ERROR
-from beetle_omni_ros.flight.loop import ARMING_TIME
+from beetle_omni_ros.flight.component import ERROR, made
+from beetle_omni_ros.flight.loop import ARMING_TIME, collector_off, FlightLoop
 from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import find_robot, RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
@@ -27,12 +31,15 @@ from beetle_omni_ros.ros.graph import (
     BRIDGES,
     child_environment,
     COMPOSED,
+    CONTROLLER,
     Graph,
+    NODES,
+    Parameters,
     plan,
     reserved_domain,
 )
 from beetle_omni_ros.ros.operator import NEVER, Operator
-from beetle_omni_ros.ros.pace import too_slow
+from beetle_omni_ros.ros.runner import REAL_TIME_PRIORITY
 from beetle_omni_ros.show import table
 from beetle_omni_ros.show.page import print_end
 from beetle_omni_ros.sim.faults import DEVICES, load_faults
@@ -51,18 +58,15 @@ PACING = 'sim_node: pacing'
 FILM = 'flight.html'        # of --view, in the folder of the bag
 
 
-def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
-            bag: Path, seed: int = 0, conditions: str = 'nominal',
-            actuators: str | None = None, clock: str = 'auto',
-            robot: Path | None = None, plant: Path | None = None, nmpc: Path | None = None,
-            policy: Path | None = None, standby: bool = True,
+def run_fly(*, bag: Path, controller: str = registry.DEFAULT, task: str = 'waypoints',
+            robot: Path | None = None, plant: Path | None = None, seed: int = 0,
             faults: Path | None = None, json_path: Path | None = None,
-            components: Sequence[str] = (), domain_id: int | None = None, view: bool = False,
-            full: bool = False, console: Console | None = None) -> int:
+            domain_id: int | None = None, view: bool = False, full: bool = False,
+            console: Console | None = None, **more) -> int:
     """
     Fly a task through the ROS graph and print the results of the bag.
 
-    Arguments are the options of `beetle_omni fly`.
+    Arguments are the options of `beetle_omni fly`; ``more`` are those of the graph alone.
 
     Returns:
         Exit status: 0 flown to the end, 1 not.
@@ -75,54 +79,55 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
     with ExitStack() as stack:
         stack.enter_context(runner.sigterm_as_interrupt())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
-        given, bag = Path(bag), Path(bag).absolute()
         check_new(bag)
         flown_task = make_task(task, seed, registry.find(controller).reach(
             RobotParameters.load(robot)))
-        RobotParameters.load(plant or robot)
         injected = load_faults(faults) if faults else []
-        planned = partial(
-            plan, controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
-            standby=standby, robot_file=_absolute(robot and find_robot(robot)),
-            plant_file=_absolute(plant and find_robot(plant)),
-            conditions=conditions, seed=int(seed),
-            task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-            ports=str(folder), actuators=_checked(injected, actuators), components=components)
-        nodes, left_out = planned(clock='system' if clock == 'auto' else clock)
-        if clock == 'auto':
-            clock = _clock(nodes, robot, actuators, console)
-            nodes, left_out = planned(clock=clock)
-        nodes['sim_node']['task_faults'] = '; '.join(map(str, injected))
-        if clock == 'simulated':    # it begins when all nodes are there
-            nodes['sim_node']['pause_at'] = 0.0
-        for name, reason in left_out.items():
-            _print(console, f'{name} does not stand by: {reason}')
-        controller = registry.find(controller).name
+        nodes, clock = _planned(console, folder, controller, task, bag, robot, plant, seed,
+                                injected, **more)
         number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
         if view:
             stack.enter_context(viewer_process(number, console))
         else:
             _print(console, f'to watch: beetle_omni view --domain-id {number}')
-        meta = {'task': task, 'conditions': conditions, 'seed': seed,
+        meta = {'task': task, 'conditions': nodes['sim_node']['conditions'], 'seed': seed,
                 'robot': str(robot) if robot else 'params/robot.yaml',
                 'plant': str(plant) if plant else None, 'version': __version__,
-                'controller': controller, 'clock': clock,
+                'controller': registry.find(controller).name, 'clock': clock,
                 'actuators': nodes['sim_node'].get('actuators', 'direct'),
                 **({'faults': [str(fault) for fault in injected]} if injected else {})}
         graph = Graph(nodes, folder, number)
         failure = slow = ''
         try:
-            failure, slow = _fly(graph, controller, flown_task, console, clock == 'simulated')
+            failure, slow = _fly(graph, meta['controller'], flown_task, console,
+                                 clock == 'simulated')
         except KeyboardInterrupt:
             meta['interrupted'] = True
-        log = given / LOG if bag.is_dir() else given.with_name(f'{bag.name}.log')
-        write_text(log, ''.join(f'{line}\n' for line in graph.lines()), 'log')
-        try:
-            return _conclude(bag, flown_task, meta, failure, slow, json_path, console, full, view)
-        finally:
-            film = given / FILM
-            print_end(console, [given, log, *([film] if film.exists() else []), json_path],
-                      *([('report', given), ('view', given)] if bag.exists() else ()))
+        return _conclude(graph, Path(bag), flown_task, meta, failure, slow, json_path, console,
+                         full, view)
+
+
+def _planned(console, folder, controller, task, bag, robot, plant, seed, faults, *,
+             nmpc=None, policy=None, standby=True, conditions='nominal', actuators=None,
+             clock='auto', components=()):
+    """Nodes of a flight with their parameters, and its clock."""
+    RobotParameters.load(plant or robot)
+    planned = partial(
+        plan, controller, nmpc=_absolute(nmpc), policy=str(policy or ''), standby=standby,
+        robot_file=_absolute(robot and find_robot(robot)),
+        plant_file=_absolute(plant and find_robot(plant)), conditions=conditions, seed=int(seed),
+        task=_absolute(task) if Path(task).is_file() else str(task), bag=_absolute(bag),
+        ports=str(folder), actuators=_checked(faults, actuators), components=components)
+    nodes, left_out = planned(clock='system' if clock == 'auto' else clock)
+    if clock == 'auto':
+        clock = _clock(nodes, robot, actuators, console)
+        nodes, left_out = planned(clock=clock)
+    nodes['sim_node']['task_faults'] = '; '.join(map(str, faults))
+    if clock == 'simulated':    # it begins when all nodes are there
+        nodes['sim_node']['pause_at'] = 0.0
+    for name, reason in left_out.items():
+        _print(console, f'{name} does not stand by: {reason}')
+    return nodes, clock
 
 
 def _clock(nodes, robot, actuators, console):
@@ -139,20 +144,26 @@ def _clock(nodes, robot, actuators, console):
     return 'system'
 
 
-def _conclude(bag: Path, task: Task, meta: dict, failure: str, slow: str,
-              json_path: Path | None, console: Console, full: bool, film: bool) -> int:
+def _conclude(graph, bag, task, meta, failure, slow, json_path, console, full, film) -> int:
     """Report the flight of a bag and why it failed; return the exit status."""
-    if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
-        result = _report(bag, meta['controller'], task, meta, json_path, console, full, film)
-        failure = failure or failed(result)
-    if 'interrupted' in meta:
-        if bag.exists():
-            _print(console, 'interrupted; kept what was flown')
-        raise KeyboardInterrupt
-    if failure:
-        _complain(failure + slow)
-    elif slow:
-        _print(console, slow.removeprefix('; '), style='yellow')
+    log = bag / LOG if bag.is_dir() else bag.with_name(f'{bag.name}.log')
+    write_text(log, ''.join(f'{line}\n' for line in graph.lines()), 'log')
+    try:
+        if bag.exists() and not failure.startswith(str(bag.absolute())):    # of the recorder
+            result = _report(bag, meta['controller'], task, meta, json_path, console, full, film)
+            failure = failure or failed(result)
+        if 'interrupted' in meta:
+            if bag.exists():
+                _print(console, 'interrupted; kept what was flown')
+            raise KeyboardInterrupt
+        if failure:
+            _complain(failure + slow)
+        elif slow:
+            _print(console, slow.removeprefix('; '), style='yellow')
+    finally:
+        page = bag / FILM
+        print_end(console, [bag, log, *([page] if page.exists() else []), json_path],
+                  *([('report', bag), ('view', bag)] if bag.exists() else ()))
     return runner.FAILED if failure else runner.OK
 
 
@@ -322,3 +333,59 @@ def _report(bag, controller, task, meta, json_path, console, full, film) -> dict
         from beetle_omni_ros.show.recorded import recorded_scene  # viser takes a second
         write_text(bag / FILM, recorded_scene({controller: log}), 'film')
     return results[controller]
+
+
+# Time of the graph's process, in times of the loop: messages and callbacks in Python. Measured
+# by benchmarks/graph.py, see docs/results/ros_graph.md.
+GRAPH = 4.0
+MOST = 0.95         # of a core that the graph's process may need
+CORES = 2           # one for the graph, one for bridges, operator, viewer and browser
+WINDOW, WINDOWS = 0.25, 7   # [s] of simulated time; the median of the windows counts
+
+
+def too_slow(nodes: Parameters, robot: Path | None) -> tuple[float, str]:
+    """
+    Return the share of a core that a graph in real time needs, and why it is too much, or ''.
+
+    The controllers, the estimator, the supervisor and the simulator of ``nodes`` fly in the loop
+    for a moment, with the priority of the graph. A ParameterError reports an unusable controller.
+    """
+    share = GRAPH * _time_of_loop(_loop(nodes, RobotParameters.load(robot)))
+    cores = len(os.sched_getaffinity(0))
+    if cores < CORES:
+        return share, f'real time needs {CORES} cores, this computer has {cores}'
+    if share > MOST:
+        return share, ('this computer is too slow for real time: the flight needs '
+                       f'{100 * share:.0f} % of a core, expected at most {100 * MOST:.0f} %')
+    return share, ''
+
+
+def _loop(nodes, robot):
+    """The nodes' flight in one process."""
+    aboard, components = {}, []
+    for name, values in nodes.items():
+        if 'component' in values:
+            components.append(values['component'])
+        elif NODES.get(name, CONTROLLER) == CONTROLLER:
+            entry = registry.find(values.get('controller') or name.removesuffix('_node'))
+            aboard[entry.name] = entry.make(robot, ControllerOptions(
+                parameters=values.get(f'{entry.name}_file'), policy=values.get('policy')))
+    return FlightLoop(robot, robot, aboard, Recorder(), others=made(components, robot))
+
+
+def _time_of_loop(loop):
+    """Time of a simulated second in flight, at real-time priority if the system permits it."""
+    times, before = [], (os.sched_getscheduler(0), os.sched_getparam(0))
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(REAL_TIME_PRIORITY))
+    try:
+        with collector_off():
+            with suppress(RunError):    # the graph reports it
+                loop.take_off()
+            for _ in range(WINDOWS):
+                begin = time.perf_counter()
+                loop.run(WINDOW)
+                times.append(time.perf_counter() - begin)
+    finally:
+        os.sched_setscheduler(0, *before)
+    return median(times) / WINDOW

@@ -29,15 +29,15 @@ from beetle_omni_ros.model.schema import ParameterError, RunError
 
 BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
 READY = 'ready'         # begin of a bridge's state
-CONTROLLER = 'control_nodes:ControllerNode'
+CONTROLLER = 'nodes:ControllerNode'
 # Executable -> module of this folder and class.
-NODES = {'sim_node': 'sim_node:SimNode', 'ekf_node': 'control_nodes:EkfNode',
+NODES = {'sim_node': 'sim_node:SimNode', 'ekf_node': 'nodes:EkfNode',
          'nmpc_node': CONTROLLER, 'rl_node': CONTROLLER,
-         'supervisor_node': 'control_nodes:SupervisorNode',
+         'supervisor_node': 'nodes:SupervisorNode',
          'joint_bridge_node': 'bridge_nodes:JointBridgeNode',
          'rotor_bridge_node': 'bridge_nodes:RotorBridgeNode',
-         'reference_node': 'side_nodes:ReferenceNode', 'recorder_node': 'side_nodes:RecorderNode',
-         'viewer_node': 'side_nodes:ViewerNode'}
+         'reference_node': 'nodes:ReferenceNode', 'recorder_node': 'nodes:RecorderNode',
+         'viewer_node': 'nodes:ViewerNode'}
 # Parameter autostart of a bridge -> lifecycle state to reach.
 AUTOSTART = {'none': '', 'configure': 'inactive', 'activate': 'active'}
 COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes
@@ -197,19 +197,19 @@ def controller_nodes(controller: str, robot: dict, *, standby: bool = True, nmpc
         first.make(RobotParameters.load(robot_file))
     entries = [first, *(registry.find(name) for name in registry.STANDING_BY
                         if standby and name != first.name)]
-    for option, file in (('--nmpc', nmpc), ('--policy', policy)):
-        if file and registry.OWNER[option] not in [entry.name for entry in entries]:
+    for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
+        if file and registry.OWNER[key] not in [entry.name for entry in entries]:
             raise ParameterError(f"{option} {file}: for the controller "
-                                 f"'{registry.OWNER[option]}', which does not run")
+                                 f"'{registry.OWNER[key]}', which does not run")
     nodes, left_out = {}, {}
     for entry in entries:
         node = f'{entry.name}_node'
         values = {**({} if node in NODES else {'controller': entry.reference}), **robot}
-        if nmpc and entry.option == '--nmpc' and entry.parameter_class:
+        if nmpc and entry.name == registry.OWNER['parameters'] and entry.parameter_class:
             entry.parameter_class.load(nmpc)    # an error here, not in another process
             values[f'{entry.name}_file'] = nmpc
         if entry.policy_file:
-            given = policy if entry.name == registry.OWNER['--policy'] else ''
+            given = policy if entry.name == registry.OWNER['policy'] else ''
             values |= {'policy': str(Path(given).absolute())} if given else {}
             if reason := unfit(given or entry.policy_file, robot_file):
                 if entry is first or given:

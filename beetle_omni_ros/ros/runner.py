@@ -131,12 +131,9 @@ def _names(name):
 
 
 def _stop_on_signal() -> Future:
-    """
-    Make a future that SIGINT or SIGTERM completes between two callbacks.
-
-    Python runs a signal handler only when the main thread executes Python, in an idle node up to a
-    second later. The wake-up descriptor is written at once.
-    """
+    """Make a future that SIGINT or SIGTERM completes between two callbacks."""
+    # Python runs a signal handler only when the main thread executes Python, in an idle node up to
+    # a second later. The wake-up descriptor is written at once.
     stop = Future()
     waiting, written = socket.socketpair()
     written.setblocking(False)

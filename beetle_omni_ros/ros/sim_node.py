@@ -14,10 +14,13 @@ from beetle_omni_ros.flight.component import OK, WARN
 from beetle_omni_ros.flight.surroundings import SimulatedRobot
 from beetle_omni_ros.model.schema import group, parameter, ParameterError, RunError
 from beetle_omni_ros.ros import wire
-from beetle_omni_ros.ros.node import FlightNode
-from beetle_omni_ros.ros.parameters import file_parameter
-from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
-from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
+from beetle_omni_ros.ros.node import file_parameter, FlightNode
+from beetle_omni_ros.sim.emulated.device import (
+    BoardFaults,
+    EmulatedActuators,
+    ServoFaults,
+    switched_on,
+)
 from beetle_omni_ros.sim.faults import DEVICES, parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator

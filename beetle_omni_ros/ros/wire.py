@@ -63,24 +63,16 @@ def parameter_request(name: str, value: Any) -> SetParameters.Request:
 
 
 class Publisher:
-    """Publishes the values of a topic; ``value`` is the newest one."""
+    """Publishes the values of a topic."""
 
     def __init__(self, node: Node, topic: str):
-        entry, self._topic, self.value = topic_of(topic), topic, None
+        entry, self._topic = topic_of(topic), topic
         self._publisher = node.create_publisher(message_class(entry.type), topic,
                                                 profile(entry.qos))
 
     def publish(self, value: Any, frame: str | None = None) -> None:
         """Publish one value, see :func:`serialized`."""
-        self.value = value
         self._publisher.publish(serialized(self._topic, value, frame))
-
-    def update(self, value: Any) -> bool:
-        """Publish another text or object than the newest one; return whether it is another."""
-        if value is self.value or isinstance(value, str) and value == self.value:
-            return False
-        self.publish(value)
-        return True
 
 
 def warner(node: Node) -> Callable[[str, str], None]:

@@ -8,16 +8,7 @@ import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
-from beetle_omni_ros.bags.log import (
-    estimate_errors,
-    FlightLog,
-    hold,
-    motion,
-    reference_poses,
-    roll_pitch_yaw,
-    spans,
-    target_errors,
-)
+from beetle_omni_ros.bags import log as flights
 from beetle_omni_ros.bags.metrics import L_WINDOW, U_WINDOW
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.model.schema import ParameterError, shortened
@@ -48,7 +39,7 @@ class Run:
 
     label: str      # name of its lines
     colour: str
-    log: FlightLog
+    log: flights.FlightLog
     results: dict[str, dict]        # label -> metrics, for each controller that flew
 
     def line(self, t: np.ndarray, values: np.ndarray, name: str = '', **style) -> go.Scatter:
@@ -110,10 +101,12 @@ def _mark(figure, runs, row):
     """Shade the windows of the first run's poses, and draw the faults of all runs."""
     first = runs[0].log
     stamps = [t.stamp - first.begin for t in first.targets if isinstance(t, PoseTarget)]
-    for stamp in stamps if len(stamps) <= FEW_POSES else ():
-        for (begin, end), colour in ((L_WINDOW, L_COLOUR), (U_WINDOW, U_COLOUR)):
-            figure.add_vrect(stamp + begin, stamp + end, fillcolor=colour, line_width=0,
-                             layer='below', row=row, col=1)
+    x, y = figure.data[-1].xaxis, figure.data[-1].yaxis
+    figure.layout.shapes += tuple(      # add_vrect takes tenths of a second for each
+        {'type': 'rect', 'xref': x, 'x0': stamp + begin, 'x1': stamp + end, 'layer': 'below',
+         'yref': f'{y} domain', 'y0': 0, 'y1': 1, 'fillcolor': colour, 'line': {'width': 0}}
+        for stamp in (stamps if len(stamps) <= FEW_POSES else ())
+        for (begin, end), colour in ((L_WINDOW, L_COLOUR), (U_WINDOW, U_COLOUR)))
     faults = [(at - run.log.begin, name) for run in runs
               for name, at in run.log.named_faults().items()]
     for at, name in faults[:MOST_MARKS]:
@@ -134,7 +127,7 @@ def _thinned(t, values):
 
 def _charts(runs):
     """(label, lines or bars) of each chart that has data."""
-    away = [(run, target_errors(run.log)) for run in runs]
+    away = [(run, flights.target_errors(run.log)) for run in runs]
     made = [(f'{name} error [{unit}]', [run.line(found[0], np.maximum(found[k], TINY[unit]))
                                         for run, found in away if len(found[0])])
             for k, name, unit in ((1, 'position', 'm'), (2, 'orientation', 'deg'))]
@@ -152,7 +145,7 @@ def _charts(runs):
         for run in runs for name, history in run.log.compute_history.items()
         if name in run.log.controllers()
         for key, dash in (('max', 'dot'), ('p99', 'dash'), ('median', 'solid'))]))
-    estimates = [(run, estimate_errors(run.log)) for run in runs]
+    estimates = [(run, flights.estimate_errors(run.log)) for run in runs]
     made += [(f'error of the estimated {name}', [run.line(found[0], scale * found[k])
                                                  for run, found in estimates if len(found[0])])
              for k, name, scale in ((1, 'position [mm]', 1e3), (2, 'orientation [deg]', 1.0))]
@@ -168,11 +161,11 @@ def _poses(runs):
     made: list[tuple[str, list]] = [(label, []) for label in AXES]
     tasks: list[object] = []
     for run in runs:
-        body, log = motion(run.log), run.log
-        flown = np.hstack([body.position, roll_pitch_yaw(body.quaternion)])
+        body, log = flights.motion(run.log), run.log
+        flown = np.hstack([body.position, flights.roll_pitch_yaw(body.quaternion)])
         if log.targets:
             t, wanted = _wanted(run)
-            near = hold(t, wanted, body.t)[:, 3:]
+            near = flights.hold(t, wanted, body.t)[:, 3:]
             flown[:, 3:] = near + (flown[:, 3:] - near + 180) % 360 - 180
             if log.meta.get('task') not in tasks:
                 tasks.append(log.meta.get('task'))
@@ -189,10 +182,12 @@ def _wanted(run):
     """Times (n,) [s] and position [m] and angles [deg] (n, 6) of the targets."""
     times = [np.array([target.stamp, end]) if isinstance(target, PoseTarget) else
              np.arange(target.times[0], min(end, target.times[-1]), TRAJECTORY_STEP)
-             for target, end in spans(run.log)]
-    poses = [reference_poses(target, t) for (target, _), t in zip(spans(run.log), times)]
+             for target, end in flights.spans(run.log)]
+    poses = [flights.reference_poses(target, t)
+             for (target, _), t in zip(flights.spans(run.log), times)]
     return np.concatenate(times), np.concatenate(
-        [np.hstack([position, roll_pitch_yaw(quaternion)]) for position, quaternion in poses])
+        [np.hstack([position, flights.roll_pitch_yaw(quaternion)])
+         for position, quaternion in poses])
 
 
 def _states(run):

@@ -27,7 +27,6 @@ LINES: dict[str, tuple[str, str | tuple]] = {
     'rl': (BLUE, '-'),
     'rl_bare': ('#0b2d5c', (0, (2, 1))),
     'rl_any': ('#58b4e8', (0, (5, 1.6))),
-    'rl_late': ('#4b3f9e', (0, (6, 1.6))),
     'rl_published': ('#3f8f8a', (0, (4, 1, 1, 1))),
     'nmpc_corrected': ('#b5651d', (0, (5, 1.2))),
     'nmpc_published': ('#e8960c', (0, (3, 1.2, 1, 1.2))),

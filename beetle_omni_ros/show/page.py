@@ -44,29 +44,16 @@ class Terminal(Console):
 
 @dataclass(frozen=True)
 class Grid:
-    """
-    A table of text.
+    """A table of text."""
 
-    Attributes:
-        title: one line.
-        header: titles of the columns.
-        rows: cells of each row.
-        faint: indices of rows with published results.
-        faint_columns: indices of columns with published results.
-        note: meaning of the columns, below the title.
-        best: (row, column) of cells in bold.
-        unbroken: number of first columns that a terminal never breaks.
-
-    """
-
-    title: str
-    header: list[str]
+    title: str                      # one line
+    header: list[str]               # titles of the columns
     rows: list[list[str]]
-    faint: frozenset[int] = frozenset()
-    faint_columns: frozenset[int] = frozenset()
-    note: str = ''
-    best: frozenset[tuple[int, int]] = frozenset()
-    unbroken: int = 1
+    faint: frozenset[int] = frozenset()             # indices of rows with published results
+    faint_columns: frozenset[int] = frozenset()     # the same of columns
+    note: str = ''                  # meaning of the columns, below the title
+    best: frozenset[tuple[int, int]] = frozenset()  # (row, column) of cells in bold
+    unbroken: int = 1               # number of first columns that a terminal never breaks
 
 
 def print_grids(shown: list[Grid], console: Console) -> None:

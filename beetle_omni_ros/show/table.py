@@ -5,8 +5,8 @@ from collections.abc import Callable
 from rich.console import Console
 
 from beetle_omni_ros.bags.metrics import at
-from beetle_omni_ros.model.schema import shortened
-from beetle_omni_ros.show.page import ABSENT, Grid, number, print_grids, Terminal
+from beetle_omni_ros.model.schema import parse_yaml, shortened
+from beetle_omni_ros.show.page import ABSENT, Grid, number, print_grids, shipped, Terminal
 
 FILES, SHIPPED_ROBOT = ('robot', 'plant'), 'params/robot.yaml'    # keys in the metadata
 
@@ -31,70 +31,9 @@ EFFORT_ROWS = (
     ('CPU of a step, max [ms]', 'compute_ms.max', 2),
     ('deadline misses', 'compute_ms.deadline_misses', 0))
 
-# Published results of the same tasks, in the form of our metrics. Source: Zhang et al., Learning
-# Agile and Robust Omnidirectional Aerial Motion on Overactuated Tiltable-Quadrotors: tables of
-# continuous pose reaching in simulation (100 random poses) and in the real world (five waypoints),
-# and the text on tracking.
-RANDOM_POSES = {
-    'NMPC': {'mean': {'U_position_m': 0.02, 'U_orientation_deg': 40.99,
-                      'L_position_m': 0.31, 'L_orientation_deg': 51.75},
-             'min': {'U_position_m': 0.002, 'U_orientation_deg': 0.41,
-                     'L_position_m': 0.09, 'L_orientation_deg': 6.38},
-             'max': {'U_position_m': 0.116, 'U_orientation_deg': 136.97,
-                     'L_position_m': 0.76, 'L_orientation_deg': 143.15},
-             'hover_speed_mean_m_s': 0.008, 'hover_speed_std_m_s': 0.0005,
-             'hover_angular_speed_mean_rad_s': 0.007, 'hover_angular_speed_std_rad_s': 0.003,
-             'joint_error_mean_rad': 0.004, 'joint_error_std_rad': 0.011,
-             'thrust_mean_N': 9.17, 'thrust_std_N': 3.48},
-    'RL': {'mean': {'U_position_m': 0.08, 'U_orientation_deg': 5.89,
-                    'L_position_m': 0.18, 'L_orientation_deg': 13.59},
-           'min': {'U_position_m': 0.014, 'U_orientation_deg': 0.34,
-                   'L_position_m': 0.06, 'L_orientation_deg': 0.75},
-           'max': {'U_position_m': 0.232, 'U_orientation_deg': 85.49,
-                   'L_position_m': 0.58, 'L_orientation_deg': 104.35},
-           'hover_speed_mean_m_s': 0.015, 'hover_speed_std_m_s': 0.049,
-           'hover_angular_speed_mean_rad_s': 0.012, 'hover_angular_speed_std_rad_s': 0.044,
-           'joint_error_mean_rad': 0.026, 'joint_error_std_rad': 0.074,
-           'thrust_mean_N': 10.08, 'thrust_std_N': 3.36},
-}
-
-WAYPOINTS = {  # real robot; poses in the order of tasks.WAYPOINTS
-    'NMPC, real robot': {'mean': {'U_position_m': 0.042, 'U_orientation_deg': 4.350},
-                         'max': {'U_position_m': 0.074, 'U_orientation_deg': 8.225}},
-    'RL, real robot': {'mean': {'U_position_m': 0.077, 'U_orientation_deg': 4.261},
-                       'max': {'U_position_m': 0.114, 'U_orientation_deg': 5.561}},
-}
-
-# Levels at which control was lost in Gazebo, from the text; other levels are not published.
-DISTURBANCE = {
-    'NMPC': {'force_N': 100.0, 'torque_N_m': 25.0},
-    'RL': {'force_N': 100.0, 'torque_N_m': 15.0},
-}
-
-LEMNISCATE = {
-    'NMPC, real robot': {'position_mean_m': 0.05, 'position_std_m': 0.02,
-                         'orientation_mean_deg': 5.19, 'orientation_std_deg': 2.46},
-    'RL, real robot': {'position_mean_m': 0.16, 'position_std_m': 0.04,
-                       'orientation_mean_deg': 8.06, 'orientation_std_deg': 2.45},
-}
-
-# Real robot, from the text: before a fan, and pushed by a stick.
-WIND = {
-    'NMPC, real robot': {'position_mean_m': 0.04, 'position_std_m': 0.028,
-                         'orientation_mean_deg': 4.27, 'orientation_std_deg': 1.32},
-    'RL, real robot': {'position_mean_m': 0.10, 'position_std_m': 0.005,
-                       'orientation_mean_deg': 3.55, 'orientation_std_deg': 0.63},
-}
-PUSHED = {
-    'NMPC, real robot': {'speed_mean_m_s': 0.033, 'angular_speed_mean_rad_s': 0.092},
-    'RL, real robot': {'speed_mean_m_s': 0.025, 'angular_speed_mean_rad_s': 0.081},
-}
-
-# Rise times of the same laboratory's NMPC: Li et al., Servo Integrated Nonlinear Model Predictive
-# Control for Overactuated Tiltable-Quadrotors (arXiv 2405.09871).
-RISE = {'x': 0.71, 'y': 0.70, 'z': 0.58, 'roll': 0.91, 'pitch': 0.89, 'yaw': 0.68}
-
-POSES = {'random100': RANDOM_POSES, 'waypoints': WAYPOINTS}     # of a task
+TEXTS = parse_yaml(shipped('comparison.yaml'))      # published results and texts of comparisons
+PUBLISHED = TEXTS['published']
+POSES = {'random100': PUBLISHED['random'], 'waypoints': PUBLISHED['waypoints']}     # of a task
 
 
 # Columns of a table: heading, path in a part, digits. {} stands for mean, std and max of an error.
@@ -143,13 +82,12 @@ def grids(results: dict, *, full: bool = False) -> list[Grid]:
         found = [(label, *part) for label, result in by_label.items() if key in result
                  for part in parts(result[key])[0 if full or key == 'steps' else -1:]]
         if found:
-            others = {'trajectory': LEMNISCATE if task == 'lemniscate' else {}, 'wind': WIND,
-                      'pushes': PUSHED}.get(key, {})
+            others = PUBLISHED.get(task if key == 'trajectory' else key, {})
             printed = [(f'published {name}', 'all', part)
                        for name, part in _in_order(others, by_label).items()]
             if key == 'steps':
                 printed = [('published NMPC', axis, {'rise_s': rise})
-                           for axis, rise in RISE.items()]
+                           for axis, rise in PUBLISHED['rise'].items()]
             rows = [[label, name, *(_cell(part, path, digits) for _, path, digits in columns)]
                     for label, name, part in found + printed]
             made.append(Grid(title, ['', heading, *(text for text, *_ in columns)], rows,

@@ -162,7 +162,8 @@ class Plant:
         """Advance one tick with the present targets; a RunError reports a diverged state."""
         model, data = self.model, self.data
         if self._loads.active:
-            self._load_servos()
+            self._target[:], load = self._loads(self._commanded_tilt, self._scale * data.act)
+            data.qfrc_applied[6:] = load + self._friction
         touching, fast = self._near_limits()
         model.opt.disableflags = self._flags if touching else self._flags | NO_CONSTRAINT
         substeps = min(FLOOR_SUBSTEPS, self._substeps) if fast and data.ncon else self._substeps
@@ -219,11 +220,8 @@ class Plant:
         limits[4:, 1] = clipped(gain * (rate_limit - rate), -effort, effort)
 
     def _apply_forces(self, ahead=0.0):
-        """
-        Apply the external wrench and the effects' forces, predicted ``ahead`` [s] from now.
-
-        Those in the middle of a tick, held during it, are accurate to second order.
-        """
+        """Apply the external wrench and the effects' forces, predicted ``ahead`` [s] from now."""
+        # Those in the middle of a tick, held during it, are accurate to second order.
         applied = self._applied
         applied[:] = self.wrench
         if not self._added.active:
@@ -244,17 +242,9 @@ class Plant:
             tilt_rate=motion[6:], thrust=thrust, thrust_rate=(commanded - thrust) / lag,
             voltage_ratio=self.voltage_ratio)
 
-    def _load_servos(self):
-        """Set servo targets and joint torques from the commands by the effects on servos."""
-        self._target[:], load = self._loads(self._commanded_tilt, self._scale * self.data.act)
-        self.data.qfrc_applied[6:] = load + self._friction
-
     def _rub(self, others):
-        """
-        Set the friction of the joints for one substep: what stops them, within its limit.
-
-        So a joint below its stiction rests without the solver of contacts.
-        """
+        """Set the friction of the joints for one substep: what stops them, within its limit."""
+        # So a joint below its stiction rests without the solver of contacts.
         joints, model, rate = self._robot.joints, self.model, self._rate
         limits = model.actuator_forcerange[4:].T if model.actuator_forcelimited[4:].all() \
             else (-np.inf, np.inf)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.model import readings, rotations
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.rotations import BodyState
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.parameters import Conditions, RPM_AT_1_NEWTON, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant
@@ -130,12 +130,9 @@ class Sensors:
         return ticks
 
     def _motion(self, before, after):
-        """
-        Mean specific force [m/s^2] and angular rate [rad/s] (6,) of the IMU between two states.
-
-        A MEMS IMU samples at several kHz and filters before it decimates to 200 Hz. A sample of
-        one instant would alias the fast accelerations of a tilting module into velocity errors.
-        """
+        """Mean specific force [m/s^2] and rate [rad/s] (6,) of the IMU between two states."""
+        # A MEMS IMU samples at several kHz and filters before it decimates to 200 Hz. A sample of
+        # one instant would alias the fast accelerations of a tilting module into velocity errors.
         x, y, z, w = own = before.quaternion.tolist()
         turn = rotations.log(rotations.product(-x, -y, -z, w, *after.quaternion.tolist()))
         middle = rotations.product(*own, *rotations.exp_parts(*(0.5 * turn).tolist()))

@@ -253,13 +253,10 @@ class Simulator:
         return frame
 
     def _watch_contact(self, before, contact):
-        """
-        Update touchdown and damage by the contact after a tick.
-
-        A robot that has flown breaks if its first contact is too fast, or a contact too inclined.
-        One that has not flown may be placed on its side. In the state ``before`` the tick the
-        floor has not slowed the robot yet.
-        """
+        """Update touchdown and damage by the contact after a tick."""
+        # A robot that has flown breaks if its first contact is too fast, or a contact too
+        # inclined. One that has not flown may be placed on its side. In the state ``before`` the
+        # tick the floor has not slowed the robot yet.
         limits = self._parameters
         if not contact:
             self._airborne += self.tick

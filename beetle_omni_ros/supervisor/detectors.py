@@ -20,7 +20,7 @@ from beetle_omni_ros.model.allocation import (
 )
 from beetle_omni_ros.model.degraded import sphere
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.thrust_map import ThrustMap
+from beetle_omni_ros.model.parts import ThrustMap
 from beetle_omni_ros.supervisor.readings import JointWatch, MocapWatch, SpeedWatch
 from beetle_omni_ros.supervisor.wrench import ContactWatch, NEAR_GROUND, WrenchWatch
 

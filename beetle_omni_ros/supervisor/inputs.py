@@ -14,15 +14,8 @@ from beetle_omni_ros.estimation.inputs import SpikeFilter
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.allocation import ActuatorHealth, Allocator
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.supervisor import commands
 from beetle_omni_ros.supervisor.backup import BackupEstimator
-from beetle_omni_ros.supervisor.commands import (
-    CommandStream,
-    FROZEN,
-    JUMP,
-    Lateness,
-    SAME,
-    Silence,
-)
 from beetle_omni_ros.supervisor.detectors import FaultWatch
 from beetle_omni_ros.supervisor.interface import Event, INFO, SupervisorParameters, WARNING
 from beetle_omni_ros.supervisor.way import inclination
@@ -82,17 +75,18 @@ class Inputs:
         self._said: dict[str, float] = {}   # when the events with a key were last added [s]
         self.watch = FaultWatch(robot, self.allocator)
         self.faults = self.watch.faults
-        self.ages = Lateness(parameters.age_limit)
-        self.streams = {name: CommandStream(robot, parameters.age_limit) for name in controllers}
+        self.ages = commands.Lateness(parameters.age_limit)
+        self.streams = {name: commands.CommandStream(robot, parameters.age_limit)
+                        for name in controllers}
         self.backup = BackupEstimator(robot.gravity)
         self.estimate = State(-np.inf, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]),
                               np.zeros(3), np.zeros(4), np.zeros(4), -np.inf)
         self._offered = self.estimate       # the one before, accepted or not
         self._doubted = -np.inf     # stamp of the last refused estimate that controllers also have
         self.refused = Counter[str]()
-        self.ekf, self.joints = Silence(ESTIMATE_TIMEOUT), Silence(JOINT_TIMEOUT)
-        self.imu, self.mocap = Silence(IMU_TIMEOUT), Silence(MOCAP_TIMEOUT)
-        self.rotors = Silence(ROTORS_TIMEOUT)
+        self.ekf, self.joints = commands.Silence(ESTIMATE_TIMEOUT), commands.Silence(JOINT_TIMEOUT)
+        self.imu, self.mocap = commands.Silence(IMU_TIMEOUT), commands.Silence(MOCAP_TIMEOUT)
+        self.rotors = commands.Silence(ROTORS_TIMEOUT)
         self.tilt, self.tilt_velocity, self.tilt_stamp = np.zeros(4), np.zeros(4), -np.inf
         self.voltage: float | None = None
         self.bridges: dict[str, str] = {}
@@ -138,18 +132,18 @@ class Inputs:
         before, self._offered = self._offered, state
         was, at = before.position.tolist(), state.position.tolist()
         self._same = self._same + 1 if was == at else 0
-        if self._same >= SAME and self.airborne:
-            return FROZEN
+        if self._same >= commands.SAME and self.airborne:
+            return commands.FROZEN
         jumped = 0 < state.stamp - before.stamp <= ESTIMATE_TIMEOUT and (
             dist(was, at) > JUMP_POSITION
             or rotations.geodesic_angle(before.quaternion, state.quaternion) > JUMP_ATTITUDE)
-        return JUMP if jumped else ''
+        return commands.JUMP if jumped else ''
 
     def on_command(self, controller: str, command: Command, now: float) -> bool:
         """Check one command of one controller; False when it is refused (and counted)."""
         reason = self.streams[controller].offer(command, now, self._doubted)
         if reason:
-            self.say(INFO if reason == JUMP else WARNING,
+            self.say(INFO if reason == commands.JUMP else WARNING,
                      f'{controller}_node: command refused: {reason}', f'{controller}: {reason}')
         return not reason
 

@@ -209,12 +209,9 @@ class Landing:
         self.ramp = Ramp(state.stamp, coasted(state), way, [(0.0, 0.0), *knots])
 
     def _escape(self, state, climbed):
-        """
-        First to the attitude where control is regained soonest, then towards level.
-
-        With a weak pack the attitudes on the side can be passed only fast, at a loss of height. A
-        low robot on its back remains there and climbs first.
-        """
+        """First to the attitude where control is regained soonest, then towards level."""
+        # With a weak pack the attitudes on the side can be passed only fast, at a loss of height.
+        # A low robot on its back remains there and climbs first.
         inputs, height = self._inputs, self._inputs.height
         holding = Holding(inputs.robot, inputs.health)
         on_back = inclination(state.quaternion) > 0.5 * np.pi

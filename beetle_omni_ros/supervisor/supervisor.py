@@ -11,19 +11,8 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, Fallback, PoseTarget, Target
+from beetle_omni_ros.model import mode
 from beetle_omni_ros.model.allocation import ALL_HEALTHY
-from beetle_omni_ros.model.mode import (
-    COMMAND_AGE,
-    DISARMED,
-    FALLBACK,
-    FLYING,
-    IN_FLIGHT,
-    LANDING,
-    Mode,
-    MOTORS_OFF,
-    STOPPED,
-    TAKEOFF,
-)
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.supervisor.commands import HANDOVER_TIME, Output
 from beetle_omni_ros.supervisor.inputs import ARM_TILT, Inputs
@@ -72,10 +61,10 @@ class Supervisor:
         self._takeoff_height = parameters.takeoff_height
         self._pilot = registry.pilot(controllers)
         self._hover = fallback
-        self.state, self.source = DISARMED, 'none'
+        self.state, self.source = mode.DISARMED, 'none'
         self.target_override: Target | None = None
-        self._cycle = {TAKEOFF: self._take_off, FLYING: self._fly, FALLBACK: self._hold,
-                       LANDING: self._descend}
+        self._cycle = {mode.TAKEOFF: self._take_off, mode.FLYING: self._fly,
+                       mode.FALLBACK: self._hold, mode.LANDING: self._descend}
         # Objects of the present state, created when it is entered.
         self._takeoff: Takeoff
         self._landing: Landing
@@ -94,7 +83,8 @@ class Supervisor:
 
     def arm(self, now: float) -> Answer:
         """Start the motors and take off, or return the reason of the refusal."""
-        reason = self.why_not_arm() if self.state == DISARMED else f'{self.state}, not disarmed'
+        reason = self.why_not_arm() if self.state == mode.DISARMED \
+            else f'{self.state}, not disarmed'
         if reason:
             return self._refuse(f'arm refused: {reason}')
         self.output.in_force = self.output.given = None
@@ -104,27 +94,27 @@ class Supervisor:
         self._watch.reset()
         self._acted_on = ALL_HEALTHY
         self._hover.set_health(ALL_HEALTHY)
-        return self._enter(TAKEOFF, INFO, 'armed: takeoff')
+        return self._enter(mode.TAKEOFF, INFO, 'armed: takeoff')
 
     def disarm(self, now: float) -> Answer:
         """Motors off, on the ground or after an emergency stop; refused in the air."""
         if self.inputs.airborne:
             return self._refuse(f'disarm refused: {self.state}; land or emergency_stop')
-        if self.state == DISARMED:
+        if self.state == mode.DISARMED:
             return Answer(True, 'already disarmed')
-        return self._enter(DISARMED, INFO, 'disarmed')
+        return self._enter(mode.DISARMED, INFO, 'disarmed')
 
     def emergency_stop(self, now: float, reason: str = 'requested') -> Answer:
         """Motors off at once, latched until disarmed."""
-        if self.state == STOPPED:
+        if self.state == mode.STOPPED:
             return Answer(True, 'already stopped')
-        return self._enter(STOPPED, ERROR, f'emergency stop: {reason}')
+        return self._enter(mode.STOPPED, ERROR, f'emergency stop: {reason}')
 
     def land(self, now: float) -> Answer:
         """Descend at the present position, motors off at the ground."""
-        if self.state not in IN_FLIGHT:
+        if self.state not in mode.IN_FLIGHT:
             return self._refuse(f'land refused: {self.state}, not in flight')
-        if self.state == LANDING:
+        if self.state == mode.LANDING:
             return Answer(True, 'already landing')
         return self._land(now, INFO, 'landing on request')
 
@@ -136,7 +126,7 @@ class Supervisor:
         if stream is None:
             return self._refuse(f"select refused: unknown controller '{controller}'; known: "
                                 f"{', '.join(self.inputs.streams)}")
-        if self.state in IN_FLIGHT and not stream.good:
+        if self.state in mode.IN_FLIGHT and not stream.good:
             return self._refuse(f'select refused: {controller}_node {stream.complaint}; '
                                 f'{self.active} stays selected')
         self.active = controller
@@ -160,15 +150,15 @@ class Supervisor:
         if now < before:    # the clock was set back
             self._hover.reset()
             self.output.hand_over_left = 0.0
-            if self.state == LANDING:
+            if self.state == mode.LANDING:
                 self._landing.set_out()
         self._in_state += dt
         self._look_for_faults(now, now - before)
-        if self.state in IN_FLIGHT:
+        if self.state in mode.IN_FLIGHT:
             self._react(now)
         command = self._guarded(self._cycle.get(self.state, self._stand)(now, dt), now)
-        if self.state in IN_FLIGHT:
-            self.inputs.airborne = self.state != TAKEOFF or self._takeoff.airborne
+        if self.state in mode.IN_FLIGHT:
+            self.inputs.airborne = self.state != mode.TAKEOFF or self._takeoff.airborne
             self.output.turn_rotors(dt, command)
         return command
 
@@ -199,16 +189,16 @@ class Supervisor:
         if not inputs.airborne:
             return
         contact, poses = self._watch.contact.reason, inputs.backup.poses
-        flies = self.state == FLYING or self._in_state < LATE_TIME
+        flies = self.state == mode.FLYING or self._in_state < LATE_TIME
         self._watch.paused = inputs.ages.partly \
             or flies and inputs.streams[self.active].ages.partly
-        if paused > COMMAND_AGE:
+        if paused > mode.COMMAND_AGE:
             self._watch.name('supervisor_paused', now)
             self._watch.restart()
             self._resumed = now
             self._say(WARNING, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: '
                       'the actuators had stopped')
-            if self.state == FLYING:
+            if self.state == mode.FLYING:
                 self._fall_back(WARNING, 'fallback to hover after the pause')
         # Messages queued during the pause are older. The estimate may be wrong after a fall.
         elif now - self._resumed < RESUMING and not inputs.mocap.silent \
@@ -217,8 +207,8 @@ class Supervisor:
         if not contact:
             if inputs.health is not self._acted_on:
                 self._degrade(now)
-        elif self.state == LANDING and inclination(inputs.best.quaternion) < ARM_TILT:
-            self._enter(DISARMED, INFO, f'on the ground, {contact}: motors off, disarmed')
+        elif self.state == mode.LANDING and inclination(inputs.best.quaternion) < ARM_TILT:
+            self._enter(mode.DISARMED, INFO, f'on the ground, {contact}: motors off, disarmed')
         else:
             self._watch.name('crash', now)
             self.emergency_stop(now, f'crash: {contact}')
@@ -229,13 +219,13 @@ class Supervisor:
         if self.inputs.health.healthy:
             return      # a zero has moved, which is corrected in commands and readings
         self._hover.set_health(self.inputs.health)
-        if self.state != LANDING:
+        if self.state != mode.LANDING:
             self._land(now, ERROR, f"{', '.join(self.faults)}: landing with what is left")
         elif before.same_actuators(self.inputs.health):
             return
         else:
             self._landing.set_out()
-        if self.state == LANDING:
+        if self.state == mode.LANDING:
             self.target_override = self._landing.way
 
     def _react(self, now):
@@ -246,18 +236,18 @@ class Supervisor:
         no_rotors = inputs.unready('rotor')
         if no_rotors and not inputs.bridges['rotor'].startswith('silent:'):
             if not inputs.airborne:
-                self._enter(DISARMED, ERROR, f'{no_rotors}; still on the ground: motors off')
+                self._enter(mode.DISARMED, ERROR, f'{no_rotors}; still on the ground: motors off')
             else:
                 self._watch.name('rotor_bridge_lost', now)
                 self.emergency_stop(now, no_rotors)
-        elif self.state == LANDING:
+        elif self.state == mode.LANDING:
             self._limit_landing(now)
-        elif self.state == FALLBACK and self._in_state > FALLBACK_TIME:
+        elif self.state == mode.FALLBACK and self._in_state > FALLBACK_TIME:
             text = f'{self.active}_node not good for {self._in_state:.0f} s: landing'
             self._land(now, ERROR, text, 'controller_lost')
         elif reason := why_land(inputs):
             self._land(now, ERROR, *reason)
-        elif inputs.lost and self.state == FLYING:
+        elif inputs.lost and self.state == mode.FLYING:
             self._watch.name('control_lost', now)
             self._fall_back(ERROR, f'tumbling or falling under {self.active}_node: fallback '
                                    'to hover')
@@ -276,11 +266,8 @@ class Supervisor:
     # One function for each state --------------------------------------------------------------
 
     def _stand(self, now, dt):
-        """
-        Motors off: zero thrust for a short time, then no command.
-
-        A rotor that ignores its thrust command is turned so that it presses on the floor.
-        """
+        """Motors off: zero thrust for a short time, then no command."""
+        # A rotor that ignores its thrust command is turned so that it presses on the floor.
         self.source = 'none'
         last = self.output.in_force
         if self._in_state > STOP_TIME + 1e-9 or last is None:
@@ -293,12 +280,12 @@ class Supervisor:
         self.source = 'hover'
         command = self._takeoff.step(self._seen, dt)
         if self._takeoff.failure:
-            self._enter(DISARMED, ERROR, f'takeoff failed: {self._takeoff.failure}')
+            self._enter(mode.DISARMED, ERROR, f'takeoff failed: {self._takeoff.failure}')
             return self._stand(now, dt)
         if self._takeoff.done:
             stream = self.inputs.streams[self.active]
             if stream.good:
-                self._enter(FLYING, INFO, f'takeoff done: {self.active} flies')
+                self._enter(mode.FLYING, INFO, f'takeoff done: {self.active} flies')
             else:
                 self._fall_back(WARNING, f'takeoff done, but {self.active}_node '
                                 f'{stream.complaint}: hover waits for it')
@@ -319,7 +306,7 @@ class Supervisor:
     def _hold(self, now, dt):
         is_good = self.inputs.streams[self.active].good and not self.inputs.lost
         if is_good and self._in_state >= RESUMING:
-            self._enter(FLYING, INFO, f'{self.active}_node good again: it flies')
+            self._enter(mode.FLYING, INFO, f'{self.active}_node good again: it flies')
             return self._fly(now, dt)
         self.source, state = 'hover', self._seen
         if self._target is None:
@@ -338,7 +325,7 @@ class Supervisor:
             self.emergency_stop(now, self._landing.given_up)
             return self._stand(now, dt)
         if self._landing.grounded:
-            self._enter(DISARMED, INFO, 'on the ground: motors off, disarmed')
+            self._enter(mode.DISARMED, INFO, 'on the ground: motors off, disarmed')
             return self._stand(now, dt)
         pilot = self.inputs.streams.get(self._pilot)
         if self.target_override is not None and pilot is not None and pilot.good \
@@ -352,23 +339,23 @@ class Supervisor:
     def _fall_back(self, severity, text):
         """Hover at the present height, in the attitude in which the present turn ends."""
         self._target, self._height = None, float(self.inputs.estimate.position[2])
-        self._enter(FALLBACK, severity, text)
+        self._enter(mode.FALLBACK, severity, text)
 
     def _land(self, now, severity, text, name=''):
         if name:
             self._watch.name(name, now)
         if not self.inputs.airborne:
-            return self._enter(DISARMED, severity, f'{text}; still on the ground: motors off')
+            return self._enter(mode.DISARMED, severity, f'{text}; still on the ground: motors off')
         self._landing = Landing(self.inputs, self.output, self._hover)
-        return self._enter(LANDING, severity, text)
+        return self._enter(mode.LANDING, severity, text)
 
     def _enter(self, state, severity, text):
         self.state, self._in_state, self.target_override = state, 0.0, None
-        if state in MOTORS_OFF:
+        if state in mode.MOTORS_OFF:
             self.inputs.backup.running = self.inputs.airborne = False
-        if state == FLYING:
+        if state == mode.FLYING:
             self.output.hand_over_left = HANDOVER_TIME
-        if state in (FALLBACK, LANDING):
+        if state in (mode.FALLBACK, mode.LANDING):
             self.output.pull_back(self._seen.tilt)
         self._say(severity, text)
         return Answer(True, text)
@@ -380,12 +367,12 @@ class Supervisor:
     # Reports ----------------------------------------------------------------------------------
 
     @property
-    def mode(self) -> Mode:
+    def mode(self) -> mode.Mode:
         """The state with its controller or its last fault."""
-        if self.state == FLYING:
-            return Mode.of(FLYING, self.active)
-        return Mode.of(self.state, next(reversed(self.faults), '')
-                       if self.state != TAKEOFF else '')
+        if self.state == mode.FLYING:
+            return mode.Mode.of(mode.FLYING, self.active)
+        return mode.Mode.of(self.state, next(reversed(self.faults), '')
+                            if self.state != mode.TAKEOFF else '')
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """State, sources and refusals, flat, for operators and logs."""

@@ -178,12 +178,9 @@ def _path(corners):
 
 
 def _follow(tilt, ups, allocator):
-    """
-    Times (N, P) [s] that the joints need for each step of N paths, and lift lost (N,) [s].
-
-    A joint uses the nearest angle within its stops, as in the allocation. Lost lift is the thrust
-    of a rotor times the time for which it points in a wrong direction, in hover thrusts.
-    """
+    """Times (N, P) [s] that the joints need for each step of N paths, and lift lost (N,) [s]."""
+    # A joint uses the nearest angle within its stops, as in the allocation. Lost lift is the
+    # thrust of a rotor times the time for which it points in a wrong direction, in hover thrusts.
     shape = ups.shape[:2] + (ROTORS,)
     angles, thrusts = (x.reshape(shape) for x in allocator.upright(ups.reshape(-1, 3)))
     limit, hover = allocator.tilt_limit - MARGIN, np.linalg.norm(allocator.weight) / ROTORS

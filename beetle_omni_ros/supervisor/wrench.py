@@ -141,13 +141,10 @@ class WrenchWatch:
             if lost >= (TIME if slow else TIME_ALONE) or weak >= STEADY_TIME), None)
 
     def _judged(self, vectors, measured, evidence, explained, share):
-        """
-        Which rotor lacks a share of its thrust, or None, and the unexplained force (3,).
-
-        Thrust vectors of lags between the two are close to a line: a first-order lag is a point on
-        a half circle from 1 to 0, and the line cuts off at most 8 % of the circle for lags of one
-        to three.
-        """
+        """Which rotor lacks a share of its thrust, or None, and the unexplained force (3,)."""
+        # Thrust vectors of lags between the two are close to a line: a first-order lag is a point
+        # on a half circle from 1 to 0, and the line cuts off at most 8 % of the circle for lags of
+        # one to three.
         lost = None
         residuals = measured - vectors.dot(self._model)
         change = residuals[0] - residuals[1]

@@ -3,28 +3,20 @@
 import torch
 
 from beetle_omni_ros.model import dynamics as model
-from beetle_omni_ros.train.model import ARM, COULOMB, DAMPING, GAIN, LAG, MASS, STIFFNESS
+from beetle_omni_ros.model import rotations
+from beetle_omni_ros.train.model import ARM, GAIN, MASS
 
 PERIOD = 0.01   # [s] between two entries of a history
 
 
 def matrix(quaternion: torch.Tensor) -> torch.Tensor:
     """Rotation matrices (N, 3, 3) of unit quaternions (N, 4), (x, y, z, w)."""
-    x, y, z, w = quaternion.unbind(-1)
-    rows = (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    return torch.stack(rotations.entries(*quaternion.unbind(-1)), -1).unflatten(-1, (3, 3))
 
 
 def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Quaternion product (N, 4), first ``b`` then ``a``."""
-    ax, ay, az, aw = a.unbind(-1)
-    bx, by, bz, bw = b.unbind(-1)
-    return torch.stack((aw * bx + ax * bw + ay * bz - az * by,
-                        aw * by - ax * bz + ay * bw + az * bx,
-                        aw * bz + ax * by - ay * bx + az * bw,
-                        aw * bw - ax * bx - ay * by - az * bz), -1)
+    return torch.stack(rotations.product(*a.unbind(-1), *b.unbind(-1)), -1)
 
 
 def from_rotation_vector(vector: torch.Tensor) -> torch.Tensor:
@@ -117,16 +109,16 @@ def sensed(random, s, draw):
     rotation = matrix(product(x[:, model.QUATERNION], from_rotation_vector(error)))
     now = torch.cat((transpose_product(matrix(x[:, model.QUATERNION]), x[:, model.VELOCITY]),
                      x[:, model.RATE]), -1)
-    late = (s['delays'][:, 2:4] + s['delays'][:, 4:] * draw.around(1.0, 2)).clamp(min=0)
     ahead = s['extrapolated'] * s['delays'][:, 2:3]
-    motion = extrapolated(torch.cat((now[:, None], s['past_motion']), 1), late[:, :1], ahead)
+    motion = extrapolated(torch.cat((now[:, None], s['past_motion']), 1),
+                          s['delays'][:, 2:3], ahead)
     velocity = motion[:, :3] + bias[:, 6:9] + scale * draw.around(r.velocity_noise, 3)
     # A trend through two noisy readings has the weights 1 + a and -a.
     gain = ((1 + ahead / PERIOD) ** 2 + (ahead / PERIOD) ** 2).sqrt()
     rate = motion[:, 3:] + bias[:, 9:12] + scale * gain * draw.around(r.rate_noise, 3)
     tilts = torch.cat((x[:, None, model.TILT], s['past_tilt']), 1)
-    age = late[:, 1:].clamp(max=PERIOD * s['past_tilt'].shape[1])
-    tilt = delayed(tilts, age) + bias[:, 12:16] + scale * draw.around(r.tilt_noise, 4)
+    tilt = delayed(tilts, s['delays'][:, 3:4]) + bias[:, 12:16] \
+        + scale * draw.around(r.tilt_noise, 4)
     return position, rotation, velocity, rate, tilt
 
 
@@ -139,26 +131,6 @@ def delayed(history: torch.Tensor, delay: torch.Tensor) -> torch.Tensor:
     back = delay / PERIOD
     weights = (1 - (back - torch.arange(history.shape[1], device=history.device)).abs()).clamp(0)
     return (history * weights[:, :, None]).sum(1)
-
-
-def acting(sent: torch.Tensor, delay: torch.Tensor) -> tuple[tuple[torch.Tensor, ...],
-                                                             torch.Tensor]:
-    """
-    Three commands (N, 8) of which :class:`train.physics.Physics` needs the delayed ones.
-
-    Args:
-        sent: (N, H, 8) commands, newest first.
-        delay: (N, 2) of tilts and thrusts [s], at most H - 1 periods.
-
-    Returns:
-        the commands, and the rest of the delays, which is less than a period.
-
-    """
-    whole = (delay / PERIOD + 1e-4).floor()
-    place = whole.long().repeat_interleave(4, 1)[:, None]
-    first, second = (sent.gather(1, (place + k).clamp(max=sent.shape[1] - 1))[:, 0]
-                     for k in (0, 1))
-    return (first, second, second), delay - PERIOD * whole
 
 
 def extrapolated(history: torch.Tensor, delay: torch.Tensor, ahead: torch.Tensor) -> torch.Tensor:
@@ -190,23 +162,15 @@ def actor_observation(random, s, previous_action, memory, draw):
     return torch.cat(blocks, -1)
 
 
-def critic_observation(s, previous_action, older_actions, torque_ratio, memory):
-    """
-    (N, 98) true state; with ``memory``, (N, 110).
-
-    It has torques and thrusts of the rotors, trim, latencies, mean servo, lag of the rotors, depth
-    of the move, height above its floor and the commands that may not act yet.
-    """
+def critic_observation(s, previous_action, torque_ratio, memory):
+    """(N, 47) true state with torques and thrusts of the rotors and trim; + 12 with memory."""
     x = s['x']
     rotation, target = matrix(x[:, model.QUATERNION]), matrix(s['target_attitude'])
     thrust = x[:, model.THRUST]
     blocks = [transpose_product(rotation, x[:, model.VELOCITY]), x[:, model.RATE],
               transpose_product(rotation, s['target_position'] - x[:, model.POSITION]),
               rotation[:, :, 0], rotation[:, :, 2], target[:, :, 0], target[:, :, 2],
-              x[:, model.TILT], torque_ratio * thrust, thrust, previous_action, s['trim'],
-              s['delays'], *(s['body'][:, part].mean(1, keepdim=True)
-                             for part in (STIFFNESS, DAMPING, COULOMB, LAG)),
-              s['deepest'][:, None], x[:, 2:3] - s['floor'], older_actions]
+              x[:, model.TILT], torque_ratio * thrust, thrust, previous_action, s['trim']]
     if memory:
         blocks += [transpose_product(rotation, s['estimate'][:, :3]), s['estimate'][:, 3:],
                    s['body'][:, MASS], s['body'][:, ARM], s['body'][:, GAIN]]

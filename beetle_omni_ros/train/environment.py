@@ -11,7 +11,7 @@ from tensordict import TensorDict
 import torch
 
 from beetle_omni_ros.control import guidance
-from beetle_omni_ros.control.policy_file import PolicyContract, REMEMBERED, ROW
+from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.train import batch, rewards
@@ -23,11 +23,10 @@ from beetle_omni_ros.train.model import (
     MASS,
     module_reaction,
     nominal_body,
+    Physics,
 )
 from beetle_omni_ros.train.parameters import TrainParameters
-from beetle_omni_ros.train.physics import Physics
 from beetle_omni_ros.train.starts import (
-    LONGEST_DELAY,
     MISSED_ATTITUDE,
     MISSED_DEPTH,
     MISSED_POSITION,
@@ -38,7 +37,7 @@ from beetle_omni_ros.train.starts import (
 
 SUBSTEPS = 4        # of the physics in a period
 FORCE_BANDWIDTH, TORQUE_BANDWIDTH = 3.0, 4.0    # [rad/s] of the controller's estimate
-NUMBERS, STARTS = 150, 100   # random numbers for each robot and step; of new robots
+NUMBERS = 176       # random numbers for each robot and step
 REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] limits of the task metrics
 
 
@@ -92,12 +91,9 @@ class TiltableQuadrotorEnv:
             self._finish = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
         if parameters.memory:
             self.state['estimate'] = self._outside(self.state)
+        self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 138:]))
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done, self.timeout = self.reward > 0, self.reward > 0
-        self.state['history'] = torch.zeros(
-            self.num_envs, ROW * parameters.network.history, device=self.device)
-        self.observation, self.critic = self._observe(
-            self.state, batch.Draw(numbers[:, STARTS:]), ~self.done)
 
     def _tensor(self, values):
         return torch.tensor(np.asarray(values, dtype=float), dtype=torch.float32,
@@ -107,7 +103,7 @@ class TiltableQuadrotorEnv:
         return torch.rand(self.num_envs, NUMBERS, device=self.device)
 
     def get_observations(self) -> TensorDict:
-        """Observation groups 'actor' (N, 33 or 39 and history) and 'critic' (N, 98 or 110)."""
+        """Observation groups 'actor' (N, 33 or 39) and 'critic' (N, 47 or 59)."""
         return TensorDict({'actor': self.observation, 'critic': self.critic},
                           batch_size=[self.num_envs], device=self.device)
 
@@ -117,11 +113,9 @@ class TiltableQuadrotorEnv:
         command = torch.clamp(requested, self._low, self._high)
         s = self.state
         limit = self._thrust_limit()
-        sent = torch.cat((command[:, None], s['previous'][:, None], s['older']), 1)
-        sent = torch.cat((sent[..., :4], torch.minimum(sent[..., 4:], limit[:, None])), -1)
-        late = s['delays'][:, 4:] * (2 * torch.rand_like(limit) - 1)
-        given, late = batch.acting(sent, (s['delays'][:, :2] + late).clamp(0, LONGEST_DELAY))
-        x = self.physics.advance(s['x'], given, late, s['wrench'], s['body'])
+        given = tuple(torch.cat((c[:, :4], torch.minimum(c[:, 4:], limit)), -1)
+                      for c in (command, s['previous'], s['older']))
+        x = self.physics.advance(s['x'], given, s['delays'][:, :2], s['wrench'], s['body'])
         new, *results, tally = self._finish(s, x, requested, command, self._numbers(),
                                             self.weights)
         torch._foreach_copy_([s[name] for name in new], list(new.values()))
@@ -171,7 +165,7 @@ class TiltableQuadrotorEnv:
                            {'due': due, 'done': done, 'missed': missed}, draw)
         if self.cfg.memory:     # the estimate of a real robot has settled before its first target
             new['estimate'] = torch.where(done[:, None], self._outside(new), new['estimate'])
-        observation, critic = self._observe(new, draw, done)
+        observation, critic = self._observe(new, draw)
         return new, observation, critic, reward, done, timeout, tally
 
     def _push(self, s, x, draw):
@@ -195,7 +189,7 @@ class TiltableQuadrotorEnv:
             'previous_tilt_command': s['previous'][:, :4],
             'previous_thrust_command': s['previous'][:, 4:],
             'z_axis': rotation[:, :, 2], 'target_z_axis': target[:, :, 2],
-            'depth': (s['floor'][:, 0] - x[:, 2]).clamp(min=0), 'deepest': s['deepest'],
+            'depth': (s['floor'][:, 0] - x[:, 2]).clamp(min=0),
             'tilt_limit': self.robot.joints.position_limit,
             'thrust_limit': self.robot.rotors.thrust_max}
 
@@ -206,11 +200,10 @@ class TiltableQuadrotorEnv:
         motion = torch.cat((batch.transpose_product(old, s['x'][:, model.VELOCITY]),
                             s['x'][:, model.RATE]), -1)
         new.update(
-            x=x, previous=command, age=age,
-            older=torch.cat((s['previous'][:, None], s['older'][:, :-1]), 1),
+            x=x, previous=command, older=s['previous'], age=age,
             target_left=s['target_left'] - 1, deepest=torch.maximum(s['deepest'], depth),
             past_motion=torch.cat((motion[:, None], s['past_motion'][:, :3]), 1),
-            past_tilt=torch.cat((s['x'][:, None, model.TILT], s['past_tilt'][:, :-1]), 1),
+            past_tilt=torch.cat((s['x'][:, None, model.TILT], s['past_tilt'][:, :1]), 1),
             trim=self._trim(s, x))
         if self.cfg.memory:
             new['estimate'] = self._disturbance_estimate(s, new)
@@ -234,13 +227,10 @@ class TiltableQuadrotorEnv:
         return torch.cat(parts, -1)
 
     def _disturbance_estimate(self, s, new):
-        """
-        Disturbance estimate (N, 6): the wrench outside the nominal model, through a lag.
-
-        The estimator compares the measured motion with the effect of the present commands on the
-        nominal robot. A delayed rate gives an error: the difference of the delayed, extrapolated
-        change of rate and the present change.
-        """
+        """Disturbance estimate (N, 6): the wrench outside the nominal model, through a lag."""
+        # The estimator compares the measured motion with the effect of the present commands on the
+        # nominal robot. A delayed rate gives an error: the difference of the delayed, extrapolated
+        # change of rate and the present change.
         x, old, body = new['x'], s['x'], new['body']
         changes = (x[:, model.VELOCITY] - old[:, model.VELOCITY],
                    x[:, model.RATE] - old[:, model.RATE])
@@ -303,18 +293,11 @@ class TiltableQuadrotorEnv:
             changed[name] = torch.where(spread(due, new[name]), new[other], new[name])
         return changed
 
-    def _observe(self, s, draw, fresh):
-        """Observations; appends to the history, which of a ``fresh`` robot is the present."""
+    def _observe(self, s, draw):
         previous_action = (s['previous'] - self.offset) / self.scale
-        older = ((s['older'] - self.offset) / self.scale).flatten(1)
         memory = self.cfg.memory
-        seen = batch.actor_observation(self.cfg.random, s, previous_action, memory, draw)
-        row = torch.cat([seen[:, block] for block in REMEMBERED], -1)
-        history = torch.where(fresh[:, None], row.repeat(1, self.cfg.network.history),
-                              s['history'])
-        s['history'] = torch.cat((row, history), -1)[:, :history.shape[1]]
-        return torch.cat((seen, history), -1), batch.critic_observation(
-            s, previous_action, older, self._torque_ratio, memory)
+        return batch.actor_observation(self.cfg.random, s, previous_action, memory, draw), \
+            batch.critic_observation(s, previous_action, self._torque_ratio, memory)
 
     def read_tally(self) -> dict[str, float]:
         """Averages since the last call, which then restart; waits for the device."""

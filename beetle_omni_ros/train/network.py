@@ -15,7 +15,6 @@ import warnings
 
 import numpy as np
 import onnx
-from onnx import numpy_helper
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP
 import torch
@@ -23,13 +22,9 @@ import torch
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control.policy_file import (
     add_checksum,
-    HISTORY,
     INPUT,
-    NEXT_HISTORY,
     OUTPUT,
     PolicyContract,
-    REMEMBERED,
-    ROW,
     session,
 )
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -48,13 +43,7 @@ VELOCITY, ANGULAR_VELOCITY, TARGET = slice(0, 3), slice(3, 6), slice(6, 9)
 TILT = slice(21, 25)
 ACTION, ACTOR_SIZE = slice(25, 33), 33
 ROTORS, CRITIC_ACTION, TRIM = slice(25, 33), slice(33, 41), slice(41, 47)
-HIDDEN, OLDER = slice(47, 58), slice(58, 98)
-ESTIMATE = slice(98, 104)   # of a policy with memory; then mass, arm and gains of the robot
-# Sizes and scales of parts: latencies, servo, lag, depth and height; a row of the history.
-HIDDEN_SCALES = ((5, 50.0), (1, 4.0), (2, 100.0), (1, 10.0), (1, 2.0), (1, 0.5))
-ACTION_SCALES = ((4, 1.0), (4, 0.4))
-ROW_SCALES = ((3, 2.0), (3, 1.0), (4, 4.0), *ACTION_SCALES)
-MORE_FEATURES = 17      # than columns of an observation
+ESTIMATE = slice(47, 53)    # of a policy with memory; then mass, arm and gains of the robot
 
 
 def _fine(error):
@@ -67,44 +56,18 @@ NOT_LINEAR = (torch.linalg.cross, lambda a, b: (a * b).sum(-1), _fine, torch.sin
 
 
 def features(observation: torch.Tensor, not_linear=NOT_LINEAR) -> torch.Tensor:
-    """
-    (N, 50) features of (N, 33) observations, or (N, 56) of (N, 39).
-
-    Rows of a history that follow give their scaled differences from the present.
-    """
-    size, rows = parts_of(observation.shape[-1])
+    """(N, 50) features of (N, 33) observations, or (N, 56) of (N, 39)."""
     shared = _shared(observation, observation[..., ACTION], *not_linear)
-    return torch.cat([*shared, *_disturbance(observation[..., ACTOR_SIZE:size]),
-                      *(_scaled(observation[..., first:first + ROW] - remembered(observation),
-                                ROW_SCALES) for first in range(size, size + ROW * rows, ROW))], -1)
-
-
-def _scaled(value, scales):
-    parts = value.split([size for size, _ in scales], -1)
-    return torch.cat([scale * part for part, (_, scale) in zip(parts, scales)], -1)
-
-
-def parts_of(width: int) -> tuple[int, int]:
-    """Size of an observation with a history, without it, and the number of rows."""
-    size = ACTOR_SIZE + (width - ACTOR_SIZE) % ROW      # a disturbance has 6 columns, a row 18
-    return size, (width - size) // ROW
-
-
-def remembered(observation: torch.Tensor) -> torch.Tensor:
-    """(N, 18) row of the history that an observation makes."""
-    return torch.cat([observation[..., block] for block in REMEMBERED], -1)
+    return torch.cat([*shared, *_disturbance(observation[..., ACTOR_SIZE:])], -1)
 
 
 def critic_features(state: torch.Tensor) -> torch.Tensor:
-    """(N, 115) features of the (N, 98) privileged state, or (N, 127) of (N, 110)."""
-    action = state[..., CRITIC_ACTION]
-    shared = _shared(state, action, *NOT_LINEAR)
+    """(N, 64) features of the (N, 47) privileged state, or (N, 76) of (N, 59)."""
+    shared = _shared(state, state[..., CRITIC_ACTION], *NOT_LINEAR)
     rotors = state[..., ROTORS]
     return torch.cat([*shared, rotors[..., :4], THRUST * rotors[..., 4:],
-                      state[..., TRIM] / NEAR, _scaled(state[..., HIDDEN], HIDDEN_SCALES),
-                      *(_scaled(older - action, ACTION_SCALES)
-                        for older in state[..., OLDER].split(8, -1)),
-                      *_disturbance(state[..., ESTIMATE]), state[..., ESTIMATE.stop:]], -1)
+                      state[..., TRIM] / NEAR, *_disturbance(state[..., ESTIMATE]),
+                      state[..., ESTIMATE.stop:]], -1)
 
 
 def _shared(o, action, cross, dot, fine, sin, cos):
@@ -148,8 +111,7 @@ class FeatureModel(MLPModel):
                 self.distribution.log_std_param.copy_(torch.log(torch.tensor(stds)))
 
     def mean(self, observation: torch.Tensor) -> torch.Tensor:
-        """(N, 8) mean actions of (N, obs_dim or more) observations; (N, 1) values of states."""
-        observation = observation[..., :self.obs_dim]
+        """(N, 8) mean actions of (N, 33 or 39) observations; (N, 1) values of states."""
         out = self.output_scale * self.mlp(self.features(observation))
         return out + self.carry * observation[..., ACTION] if self.carry else out
 
@@ -165,41 +127,20 @@ class FeatureModel(MLPModel):
         return self.features(torch.zeros(1, self.obs_dim)).shape[-1]
 
 
-def actor_of(file: Path, like: FeatureModel) -> FeatureModel:
-    """
-    Actor of a checkpoint or of a policy file without history; ParameterError if there is none.
-
-    Its layers may be others, and its inputs the first ones of ``like``.
-    """
+def actor_of(checkpoint: Path, like: FeatureModel) -> FeatureModel:
+    """Actor of a checkpoint, whose network may have other layers; ParameterError if none."""
     try:
-        saved = _weights(file, like.output_scale) if file.suffix == '.onnx' else torch.load(
-            str(file), map_location='cpu', weights_only=True)['actor_state_dict']
-        layers = {name.removeprefix('mlp.'): value for name, value in saved.items()
-                  if name.startswith('mlp.')}
+        saved = torch.load(str(checkpoint), map_location='cpu', weights_only=True)
+        layers = {name.removeprefix('mlp.'): value for name, value
+                  in saved['actor_state_dict'].items() if name.startswith('mlp.')}
         *hidden, out = [len(value) for name, value in layers.items() if name.endswith('bias')]
         actor = copy.deepcopy(like)
-        actor.mlp = MLP(layers['0.weight'].shape[1], out, hidden)
-        actor.obs_dim = actor.mlp[0].in_features - MORE_FEATURES
+        actor.mlp = MLP(like.mlp[0].in_features, out, hidden)
         actor.mlp.load_state_dict(layers)
-        if parts_of(actor.obs_dim)[0] != parts_of(like.obs_dim)[0]:
-            raise ValueError(f'{actor.obs_dim} inputs')
     except Exception as error:      # torch's errors for a bad file have no common base class
-        raise ParameterError(f'{file}: no checkpoint of a policy with the same inputs '
+        raise ParameterError(f'{checkpoint}: no checkpoint of a policy with the same inputs '
                              f'({" ".join(str(error).split())[:160]})') from None
     return actor.to(like.mlp[0].weight.device).requires_grad_(False)
-
-
-def _weights(file, scale):
-    """Layers of a policy file, whose last one has the scale of the output and other columns."""
-    found = {each.name: torch.tensor(numpy_helper.to_array(each))
-             for each in onnx.load(file).graph.initializer}
-    layers = {name: value for name, value in found.items() if name.startswith('mlp.')}
-    last = max(layers, key=lambda name: int(name.split('.')[1]))    # has its bias alone
-    size = len(layers[f'mlp.{int(last.split(".")[1]) - 2}.bias'])
-    whole = next(value for value in found.values() if value.dim() == 2
-                 and len(value) == len(layers[last]) and value.shape[1] > size)
-    return {**layers, last: layers[last] / scale,
-            last.replace('bias', 'weight'): whole[:, :size] / scale}
 
 
 class ExportedPolicy(torch.nn.Module):
@@ -208,63 +149,45 @@ class ExportedPolicy(torch.nn.Module):
 
     Axes and products of axes are appended to the observation by two stages of products. All
     features are then one linear function of these numbers, except that errors are normalised and
-    angles become sines. The differences of the history are folded into the first layer.
+    angles become sines.
     """
 
     def __init__(self, actor: FeatureModel):
         super().__init__()
         self.mlp: MLP = copy.deepcopy(actor.mlp).cpu()
-        size, self.rows = parts_of(actor.obs_dim)
-        stages, linear = _folded(size)
+        stages, linear = _folded(actor.obs_dim)
         self.stages = [[factor.T.contiguous() for factor in stage] for stage in stages]
         count = linear.shape[1]
         self.offset = torch.zeros(count)
         self.offset[COSINES] = 0.5 * torch.pi       # cosines are sines
-        self.angles = torch.zeros(count, size)
+        self.angles = torch.zeros(count, actor.obs_dim)
         for block in (SINES, COSINES):
-            self.angles[block] = linear[:size, block].T
+            self.angles[block] = linear[:actor.obs_dim, block].T
             linear[:, block] = 0.0
         self.linear = linear
         self.norms, self.near = torch.zeros(count, count), torch.ones(count)
         for block in FINE:
             self.norms[block, block], self.near[block] = 1.0, NEAR ** 2
         last = self.mlp[-1]
-        self.carry = torch.zeros(last.out_features, size)
+        self.carry = torch.zeros(last.out_features, actor.obs_dim)
         self.carry[:, ACTION] = actor.carry * torch.eye(last.out_features)
         with torch.no_grad():
             last.weight.mul_(actor.output_scale)
             last.bias.mul_(actor.output_scale)
-            first = self.mlp[0]
-            past = first.weight[:, count:] * _scaled(torch.ones(ROW), ROW_SCALES).repeat(
-                self.rows)
-            present = past.unflatten(-1, (self.rows, ROW)).sum(1) if self.rows else past
-            first.weight = torch.nn.Parameter(torch.cat((first.weight[:, :count], past, -present),
-                                                        -1))
 
-    def forward(self, observation: torch.Tensor, history: torch.Tensor | None = None):
-        """
-        (1, 8) action of a (1, 33 or 39) observation.
-
-        With a history (1, 1 + 18 H) also the next one. Its first number is 0 if the rest is empty.
-        """
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """(1, 8) action of a (1, 33 or 39) observation."""
         linear, known = torch.nn.functional.linear, observation
         for left, right in self.stages:
             known = torch.cat((known, linear(known, left) * linear(known, right)), -1)
         sines = torch.sin(linear(observation, self.angles, self.offset))
         features = torch.addmm(sines, known, self.linear)   # of angles: nothing but the sines
         features = features / torch.sqrt(linear(features * features, self.norms, self.near))
-        if history is not None:
-            row = remembered(observation)
-            known, present = history[:, :1], row.repeat(1, self.rows)
-            past = present + known * (history[:, 1:] - present)
-            features = torch.cat((features, past, row), -1)
-            following = torch.cat((torch.ones_like(known), row, past[:, :-ROW]), -1)
         *hidden, last = self.mlp
         for layer in hidden:
             features = layer(features)
-        action = linear(torch.cat((features, observation), -1),
-                        torch.cat((last.weight, self.carry), -1), last.bias)
-        return action if history is None else (action, following)
+        return linear(torch.cat((features, observation), -1),
+                      torch.cat((last.weight, self.carry), -1), last.bias)
 
 
 # Places of the normalised errors and of the sines and cosines of the tilts in the features.
@@ -273,12 +196,9 @@ CROSS_PRODUCTS, DOT_PRODUCTS = 12, 27      # of two cross products and nine scal
 
 
 def _folded(size):
-    """
-    Left and right matrices of both stages of products, and the matrix of the features.
-
-    Features of the rows of a unit matrix are a matrix, if all that is not linear is replaced by a
-    linear function of the results of the stages.
-    """
+    """Left and right matrices of both stages of products, and the matrix of the features."""
+    # Features of the rows of a unit matrix are a matrix, if all that is not linear is replaced by
+    # a linear function of the results of the stages.
     known = torch.eye(size + CROSS_PRODUCTS + DOT_PRODUCTS)
     products = iter(known[:, size:].split(3, -1))
     crossed, dotted = [], []
@@ -310,16 +230,13 @@ def export_policy(actor: FeatureModel, path: Path, robot: RobotParameters,
 
     """
     actor = copy.deepcopy(actor).cpu().eval()
-    network, (size, rows) = ExportedPolicy(actor).eval(), parts_of(actor.obs_dim)
-    inputs = {INPUT: torch.zeros(1, size), HISTORY: torch.zeros(1, 1 + ROW * rows)}
-    kept = 2 if rows else 1
+    network, size = ExportedPolicy(actor).eval(), actor.obs_dim
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')
         logging.getLogger('torch.onnx').setLevel(logging.ERROR)
         program = torch.onnx.export(
-            network, (*inputs.values(),)[:kept], input_names=[*inputs][:kept],
-            output_names=[OUTPUT, NEXT_HISTORY][:kept], opset_version=OPSET, dynamo=True,
-            verbose=False)
+            network, (torch.zeros(1, size),), input_names=[INPUT], output_names=[OUTPUT],
+            opset_version=OPSET, dynamo=True, verbose=False)
     written = program.model_proto
     contract = PolicyContract.default(robot, parameters.memory)
     contract = replace(
@@ -337,7 +254,7 @@ def export_policy(actor: FeatureModel, path: Path, robot: RobotParameters,
     part = path.with_suffix('.part')
     onnx.save(written, str(part))
     add_checksum(part)
-    difference = _difference(actor.mean, part, size, rows)
+    difference = _difference(actor.mean, part, size)
     if not difference <= AGREEMENT:
         part.unlink()
         raise RunError(f'{path}: torch and onnxruntime differ by {difference:.2g}, more than '
@@ -346,19 +263,12 @@ def export_policy(actor: FeatureModel, path: Path, robot: RobotParameters,
     return difference
 
 
-def _difference(mean, path, size, rows):
-    """Largest relative difference of torch and onnxruntime on a sequence of observations."""
+def _difference(mean, path, size):
+    """Largest relative difference of torch and onnxruntime on random observations."""
     network = session(path.read_bytes())
     probes = torch.randn(PROBES, size, generator=torch.Generator().manual_seed(0))
-    row = remembered(probes)
-    past = torch.cat((row[:1].expand(rows, -1), row)).unfold(0, rows, 1)[:PROBES].flip(-1) \
-        .transpose(1, 2).flatten(1) if rows else probes[:, :0]
     with torch.no_grad():
-        expected = mean(torch.cat((probes, past), -1)).numpy()
-    found, given = [], {HISTORY: np.zeros((1, 1 + ROW * rows), np.float32)} if rows else {}
-    for probe in probes:
-        action, *following = network.run(None, {INPUT: probe[None].numpy(), **given})
-        given = dict(zip(given, following))
-        found.append(action)
-    found = np.concatenate(found)
+        expected = mean(probes).numpy()
+    found = np.concatenate([network.run([OUTPUT], {INPUT: row[None].numpy()})[0]
+                            for row in probes])
     return float(np.abs(found - expected).max() / max(np.abs(expected).max(), 1.0))

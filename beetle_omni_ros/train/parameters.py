@@ -105,18 +105,6 @@ class RandomParameters:
                                          unit='s', shape=(2,), low=0, high=0.02)
     command_latency: np.ndarray = parameter([0.005, 0.015], doc='delay of commands', unit='s',
                                             shape=(2,), low=0, high=0.02)
-    late_share: float = parameter(0.0, doc='fraction of robots with late commands, and fraction '
-                                  'with late joint feedback', low=0, high=1)
-    late_commands: float = parameter(0.025, doc='largest additional delay of late commands',
-                                     unit='s', low=0, high=0.03)
-    late_tilts: float = parameter(0.025, doc='largest additional age of late joint feedback',
-                                  unit='s', low=0, high=0.025)
-    jitter: float = parameter(
-        0.0, doc='change of each latency from step to step; that of a robot is a random '
-        'fraction of it', unit='s', low=0, high=0.005)
-    friction_scale: np.ndarray = parameter(
-        [1.0, 1.0], doc='factor on the friction of the servos; below zero: none', shape=(2,),
-        low=-10, high=10)
     actuators: str = parameter(
         'measured', doc='robot file whose measured intervals of servos, rotors and delays the '
         'robots cover')
@@ -179,7 +167,6 @@ class RewardWeights:
     hover_tilt_rate: float = parameter(-60.0, doc='own: smooth commands at the target')
     hover_thrust_rate: float = parameter(-1.5, doc='own: smooth commands at the target')
     sinking: float = parameter(-48.0, doc='own: below both start and target')
-    diving: float = parameter(0.0, doc='own: lowest height of a move')
     termination: float = parameter(-2000.0, doc='own: smaller than the cost of the worst flight')
     scale: float = parameter(0.01, doc='scale of the sum')
 
@@ -189,8 +176,6 @@ class NetworkParameters:
     """Networks of actor and critic."""
 
     hidden: np.ndarray = parameter([512, 256, 128], doc='layers of the actor; published')
-    history: int = parameter(0, doc='earlier steps of motion, tilts and actions that the actor '
-                                    'observes', low=0, high=100)
     critic: np.ndarray = parameter([512, 256, 128], doc='layers of the critic; published')
     output_scale: float = parameter(4.0, doc='action for each unit of the last layer', low=0.01,
                                     high=100)

@@ -20,14 +20,12 @@ SINKING_LIMIT = 0.4    # [m] largest penalty, for any depth
 
 def terms(*, position_error, attitude_error, speed, rate, tilt, tilt_rate, previous_tilt_rate,
           thrust, tilt_command, thrust_command, previous_tilt_command, previous_thrust_command,
-          z_axis, target_z_axis, depth, deepest, tilt_limit, thrust_limit
-          ) -> dict[str, torch.Tensor]:
+          z_axis, target_z_axis, depth, tilt_limit, thrust_limit) -> dict[str, torch.Tensor]:
     """
     Name of ``TERMS`` -> (N,) value without weight, of N robots after one step.
 
     The errors (N,) are distance [m] and geodesic angle [rad] to the target, speed [m/s] and rate
-    [rad/s] (N,) are norms, depth (N,) is that below both start and target [m], not negative,
-    deepest (N,) the largest depth of the move so far.
+    [rad/s] (N,) are norms, depth (N,) is that below both start and target [m], not negative.
     Tilts [rad], tilt rates [rad/s] and thrusts after the lag [N] are (N, 4). So are the commands,
     the output of the policy before limits, and the previous ones, which are limited. The axes of
     body and target (N, 3) are in world.
@@ -41,6 +39,9 @@ def terms(*, position_error, attitude_error, speed, rate, tilt, tilt_rate, previ
     near_pose = torch.exp(-p / 0.1 - angle / 0.1)
     tilt_change = ((tilt_command - previous_tilt_command) ** 2).sum(-1)
     thrust_change = ((thrust_command - previous_thrust_command) ** 2).sum(-1)
+    # Small for a few centimetres, which any quick move sinks. It saturates, because otherwise an
+    # early end of the episode would pay.
+    sunk = (depth / SINKING_LIMIT) ** 2
     return {
         'position': torch.tanh(p / 0.6),
         'pose': (1 - torch.tanh(angle / 2)) * (1 - torch.tanh(p / 2)),
@@ -65,15 +66,4 @@ def terms(*, position_error, attitude_error, speed, rate, tilt, tilt_rate, previ
         'joint_winding': (tilt.abs() - torch.pi).clamp(min=0).sum(-1),
         'hover_tilt_rate': near_pose * tilt_change,
         'hover_thrust_rate': near_pose * thrust_change,
-        'sinking': SINKING_LIMIT * _sunk(depth),
-        'diving': _sunk(torch.maximum(depth, deepest)) - _sunk(deepest)}
-
-
-def _sunk(depth):
-    """
-    Depth as a number in [0, 1), small for the few centimetres that any quick move sinks.
-
-    It saturates, because otherwise an early end of the episode would pay.
-    """
-    square = (depth / SINKING_LIMIT) ** 2
-    return square / (1 + square)
+        'sinking': SINKING_LIMIT * sunk / (1 + sunk)}

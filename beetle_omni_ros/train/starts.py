@@ -7,6 +7,8 @@ prioritised sampling of initial states, similar to that of steps in T. Schaul et
 experience replay (2016).
 """
 
+from functools import cache
+
 import numpy as np
 import torch
 
@@ -14,30 +16,16 @@ from beetle_omni_ros.model.allocation import Allocator
 from beetle_omni_ros.model.degraded import sphere
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.model import (
-    ACTUATORS,
-    actuators,
-    ARM,
-    COULOMB,
-    DAMPING,
-    GAIN,
-    LAG,
-    nominal_body,
-    STICTION,
-)
+from beetle_omni_ros.train import batch, model
 from beetle_omni_ros.train.parameters import STRATA, TrainParameters
 
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
 MOVING_SPEED, MOVING_RATE = 1.5, 3.0   # [m/s], [rad/s] largest of a moving start, each axis
-# Places of damping, friction and lag among the drawn quantities of the actuators.
-_DAMPING, _FRICTION, _LAG = (
-    slice(first.start - ACTUATORS.start, last.stop - ACTUATORS.start)
-    for first, last in ((DAMPING, DAMPING), (COULOMB, STICTION), (LAG, LAG)))
+# Places of damping and lag among the drawn quantities of the actuators.
+_DAMPING, _LAG = (slice(part.start - model.ACTUATORS.start, part.stop - model.ACTUATORS.start)
+                  for part in (model.DAMPING, model.LAG))
 DRAWN = 2048    # robots from the measured intervals, of which the robots of the training are made
-OLDER, PAST_TILTS = 5, 4    # stored commands before the previous one; stored tilts
-LONGEST_DELAY = (OLDER + 1) * batch.PERIOD      # [s] of the stored commands
-OLDEST_TILT = PAST_TILTS * batch.PERIOD         # [s]
+LONGEST_DELAY = 2 * batch.PERIOD    # [s] of the stored commands and tilts
 DIRECTIONS = 200     # of up in the body, for the thrust that a robot needs to hover
 FULL_THRUST = 0.95   # of the largest thrust, which the most demanding attitude may need
 LEAST = 0.2     # smallest drawn quantity of an actuator, as a fraction of the smallest measured
@@ -46,6 +34,14 @@ MISSED_POSITION, MISSED_ATTITUDE = 0.10, 0.10     # [m], [rad] at the end of a t
 MISSED_DEPTH = 0.15                               # [m] below both start and target, in between
 FULL = 0.01          # fraction of the robots with a stored state at which all replays happen
 FORGET_FLOWN, FORGET_MISSED = 0.5, 0.1            # probability of deletion after a replay
+
+
+@cache
+def drawn_actuators(robot_file: str, seed: int) -> np.ndarray:
+    """(DRAWN, 23) actuators and delays of robots from the intervals of a file; takes seconds."""
+    measured, rng = RobotParameters.load(robot_file), np.random.default_rng(seed)
+    return np.array([[*model.actuators(one), *one.command_delays] for one in (
+        measured.drawn(rng) for _ in range(DRAWN))])
 
 
 def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[float]]:
@@ -57,10 +53,9 @@ def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[
                              ('velocity', r.velocity_latency, 0.0),
                              ('joint feedback', r.tilt_latency, robot.sensors.encoder_delay)):
         made.append([max(float(t) + more, 0.0) for t in span])
-        stored = OLDEST_TILT if name == 'joint feedback' else LONGEST_DELAY
-        if made[-1][1] > stored + 1e-9:
+        if more and made[-1][1] > LONGEST_DELAY + 1e-9:
             raise ParameterError(f'effects: {name} are up to {1e3 * made[-1][1]:g} ms late, '
-                                 f'the training environment stores {1e3 * stored:g} ms')
+                                 f'the training environment stores {1e3 * LONGEST_DELAY:g} ms')
     return made
 
 
@@ -90,13 +85,13 @@ class Starts:
                     for k, name in enumerate(STRATA)}
         self.stratum = stratum
         self._inverse = tensor(Allocator(robot).inverse[:, :3])
-        self._weight = tensor([0.0, 0.0, nominal_body(robot)[0] * robot.gravity])
-        self._body = tensor(nominal_body(robot))
+        self._weight = tensor([0.0, 0.0, model.nominal_body(robot)[0] * robot.gravity])
+        self._body = tensor(model.nominal_body(robot))
         self._region = tensor(parameters.episode.region)
         self._rotors = torch.arange(4, device=device)
         _, thrusts = Allocator(robot).upright(sphere(DIRECTIONS))
         self._least_gain = float(thrusts.max() / (FULL_THRUST * robot.rotors.thrust_max)) \
-            / nominal_body(robot)[0]
+            / model.nominal_body(robot)[0]
         self.severity = torch.ones((), device=device)
         self._limit = float(robot.joints.position_limit)
         # plain floats, because a compiler takes numpy scalars for tensors of the host
@@ -104,12 +99,8 @@ class Starts:
         r = parameters.random
         self._latencies = latencies(parameters, robot)
         self._spread = [float(share) for share in r.actuator_spread]
-        self._friction = [float(factor) for factor in r.friction_scale]
-        measured = RobotParameters.load(r.actuators)
-        self._nominal = tensor([*actuators(robot), *robot.command_delays])
-        rng = np.random.default_rng(parameters.seed)
-        self._drawn = tensor([[*actuators(one), *one.command_delays] for one in (
-            measured.drawn(rng) for _ in range(DRAWN))])
+        self._nominal = tensor([*model.actuators(robot), *robot.command_delays])
+        self._drawn = tensor(drawn_actuators(r.actuators, parameters.seed))
         self._least = LEAST * torch.minimum(self._drawn.min(0).values, self._nominal)
         self._thrust_limit = [float(t) for t in r.thrust_limit]
 
@@ -131,9 +122,9 @@ class Starts:
         body_velocity = batch.transpose_product(batch.matrix(attitude), velocity)
         motion = torch.cat((body_velocity, rate), -1)
         command = torch.cat((tilt, thrust), -1)
-        state = {'x': x, 'previous': command, 'older': command[:, None].expand(-1, OLDER, -1),
+        state = {'x': x, 'previous': command, 'older': command,
                  'past_motion': motion[:, None].expand(-1, 4, -1),
-                 'past_tilt': tilt[:, None].expand(-1, PAST_TILTS, -1),
+                 'past_tilt': tilt[:, None].expand(-1, 2, -1),
                  'age': torch.zeros_like(tilt[:, 0]), 'trim': torch.zeros_like(x[:, :6])}
         state.update(self.target(d, x[:, :3], attitude))
         state['target_attitude'] = torch.where(self._is['hold'], attitude,
@@ -184,7 +175,6 @@ class Starts:
         slower = 1 + d.around(self._p.random.lag_scale, 2)
         made[:, _DAMPING] *= slower[:, :1]
         made[:, _LAG] *= slower[:, 1:]
-        made[:, _FRICTION] *= d.uniform(1, *self._friction).clamp(min=0)
         return made[:, :-2], made[:, -2:] - self._nominal[-2:]
 
     def _randomisation(self, d):
@@ -192,9 +182,9 @@ class Starts:
         body = self._body.expand(self._count, -1)
         load = self.severity * d.chance(r.payload_share) * d.uniform(1, 0.0, r.payload)
         mass = body[:, 0:1] * (1 + d.around(r.mass_scale, 1))
-        arm = body[:, ARM] * (1 + d.around(r.arm_scale, 1))
+        arm = body[:, model.ARM] * (1 + d.around(r.arm_scale, 1))
         weak = d.chance(r.weak_share) & (torch.floor(4 * d.uniform(1)) == self._rotors)
-        gain = body[:, GAIN] * (1 + d.around(r.thrust_scale, 1)) \
+        gain = body[:, model.GAIN] * (1 + d.around(r.thrust_scale, 1)) \
             * (1 - weak * d.uniform(1, 0.0, r.weak_loss))
         # Other robots cannot hover at every attitude.
         gain = torch.maximum(gain, self._least_gain * mass)
@@ -215,19 +205,15 @@ class Starts:
             d.around(r.position_bias, 3), d.around(r.attitude_bias, 3),
             d.around(r.velocity_bias, 3), d.around(r.rate_bias, 3), d.around(r.tilt_bias, 4),
             d.around(r.estimated_force_bias, 3), d.around(r.estimated_torque_bias, 3)), -1)
-        actuators, later = self._actuators(d)
+        quantities, later = self._actuators(d)
         delays = torch.cat([d.uniform(1, *span) for span in self._latencies], -1)
-        late = [d.chance(r.late_share) * d.uniform(1, 0.0, most)
-                for most in (r.late_commands, r.late_tilts)]
-        delays = torch.cat(((delays[:, :2] + later + late[0]).clamp(0.0, LONGEST_DELAY),
-                            delays[:, 2:3], (delays[:, 3:] + late[1]).clamp(max=OLDEST_TILT),
-                            d.uniform(1, 0.0, r.jitter)), -1)
+        delays = torch.cat(((delays[:, :2] + later).clamp(0.0, LONGEST_DELAY),
+                            delays[:, 2:]), -1)
         pushed = d.chance(r.push_share)
         extrapolated = d.chance(r.carried_share).float()
-        # Late robots that oscillate would fill the replays.
-        disturbed = (forced | strong | pushed | (load > 0) | (late[0] + late[1] > 0)).float()
+        disturbed = (forced | strong | pushed | (load > 0)).float()
         return {'thrust_limit': d.uniform(1, *self._thrust_limit),
-                'body': torch.cat((total, inertia, centre, actuators, arm, gain), -1),
+                'body': torch.cat((total, inertia, centre, quantities, arm, gain), -1),
                 'wrench': wrench,
                 'other_wrench': usual,
                 'noise': noise, 'bias': bias, 'delays': delays, 'extrapolated': extrapolated,

@@ -5,8 +5,8 @@ import numpy as np
 from beetle_omni_ros.bags.messages import Diagnostic
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.model import rotations
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.readings import BatteryReading, ImuReading, JointReading, PoseReading
+from beetle_omni_ros.model.rotations import BodyState
 
 TICK = 0.005
 
@@ -19,7 +19,7 @@ def targets_of(task, start):
 
 
 def fly(recorder, task, *, start=1.0, controller='nmpc', offset=0.02, angle=3.0, approach=0.5,
-        seed=0, duration=None, after=0.2):
+        seed=0, duration=None, after=0.2, tick=TICK):
     """
     Record a flight that follows every target with a decaying and a steady error.
 
@@ -34,6 +34,7 @@ def fly(recorder, task, *, start=1.0, controller='nmpc', offset=0.02, angle=3.0,
         seed: seed of the noise of commands and estimate.
         duration: cut the flight after this time [s].
         after: time of recording after the task [s].
+        tick: time between samples [s].
 
     """
     rng = np.random.default_rng(seed)
@@ -42,8 +43,8 @@ def fly(recorder, task, *, start=1.0, controller='nmpc', offset=0.02, angle=3.0,
     write_state(recorder, start - 1.0, 'takeoff')
     write_state(recorder, start - 0.01, f'flying:{controller}')
     target, previous, current = None, np.array([0.0, 0.0, 1.0]), -1
-    for k in range(-20, round(length / TICK) + 1):
-        t = start + k * TICK
+    for k in range(-20, round(length / tick) + 1):
+        t = start + k * tick
         while current + 1 < len(targets) and targets[current + 1].stamp <= t + 1e-9:
             current += 1
             if target is not None:
@@ -75,7 +76,7 @@ def _record(recorder, t, k, rng, position, quaternion, reference, controller):
         recorder.write(f'{controller}/command', Command(t, tilt, thrust), t + 0.002)
         write_command(recorder, t, tilt, thrust, received=t + 0.003)
     if k % 20 == 0:
-        recorder.write('battery_state', BatteryReading(t, 25.0 - 0.001 * k * TICK, -20.0))
+        recorder.write('battery_state', BatteryReading(t, 25.0 - 0.001 * t, -20.0))
     if k % 200 == 0:
         write_diagnostic(recorder, t, f'{controller}_node: compute', {
             'median_ms': 0.2, 'p99_ms': 0.4, 'max_ms': 0.9, 'deadline_misses': 0,

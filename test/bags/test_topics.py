@@ -21,7 +21,6 @@ from beetle_omni_ros.bags.topics import ALL
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.allocation import ActuatorHealth
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.mode import Mode
 from beetle_omni_ros.model.readings import (
     BatteryReading,
@@ -30,6 +29,7 @@ from beetle_omni_ros.model.readings import (
     PoseReading,
     RotorReading,
 )
+from beetle_omni_ros.model.rotations import BodyState
 
 STAMP = 1_790_000_000.25
 SERIES = ('mocap/pose', 'imu/data_raw', 'joint_states', 'battery_state', 'rotor_states', 'odom',

@@ -10,7 +10,6 @@ from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.nmpc import NmpcController, NmpcParameters
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.allocation import ALL_HEALTHY
-from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import ParameterError
 
 
@@ -95,8 +94,3 @@ def test_without_a_compiler_the_cause_is_named(monkeypatch):
     monkeypatch.setenv('CC', 'no-such-compiler')
     with pytest.raises(ParameterError, match='needs a C compiler: no C compiler found'):
         NmpcController(ROBOT)
-
-
-def test_a_file_overrides_the_actuators_of_the_robot():
-    published = NmpcParameters.load(share_path('params/nmpc_published.yaml'))
-    assert published.actuators(ROBOT) == (0.048, 3.15, 7.0, 30.0)

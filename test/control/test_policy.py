@@ -82,20 +82,6 @@ def test_targets_follow_from_the_observation_by_scale_and_offset(tmp_path, memor
     assert np.allclose(np.r_[command.tilt, command.thrust], expected, atol=1e-5)
 
 
-def test_the_history_goes_from_call_to_call_until_a_reset_or_a_gap(tmp_path):
-    weights = np.zeros((33 + 19, 8))
-    weights[33] = 1.0       # the action is the number of calls since the history was empty
-    policy = controller(write(tmp_path / 'p.onnx', weights=weights, history=19))
-
-    def calls(stamp):
-        return (policy.step(state(stamp), TARGET).tilt / policy.contract.action_scale[:4])[0]
-
-    assert [calls(1.0 + 0.01 * k) for k in range(3)] == pytest.approx([0, 1, 2])
-    assert calls(2.0) == pytest.approx(0) and calls(2.01) == pytest.approx(1)
-    policy.reset()
-    assert calls(2.02) == pytest.approx(0)
-
-
 def test_targets_are_cut_to_the_limits_of_the_actuators(tmp_path):
     bias = np.array([50.0, -50, 0, 0, 50, -50, 0, 0])
     policy = controller(write(tmp_path / 'p.onnx', bias=bias))

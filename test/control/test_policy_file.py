@@ -55,13 +55,6 @@ def test_other_metadata_are_refused_with_the_entry_and_both_values(metadata, nam
     assert '\n' not in text and all(part in text for part in named), text
 
 
-@pytest.mark.parametrize('size', [7, 20])
-def test_a_history_without_whole_rows_is_refused(tmp_path, size):
-    path = write(tmp_path / 'p.onnx', history=size)
-    with pytest.raises(ParameterError, match=r'expected .*history'):
-        PolicyNetwork(path, ROBOT)
-
-
 @pytest.mark.parametrize('flown, named', [
     (replace(ROBOT, mass=3.2, joints=replace(ROBOT.joints, kp=0.2)),
      ['mass 3.0386 in training, 3.2 here', 'joints.kp 0.3449 in training, 0.2 here']),
@@ -95,7 +88,7 @@ def test_the_hash_of_values_in_any_order_with_further_ones_is_that_of_the_robot(
     assert robot_hash(turned) == robot_hash(trained_for(ROBOT)) == robot_hash(ROBOT)
 
 
-@pytest.mark.parametrize('name', ['rl', 'rl_any', 'rl_late', 'rl_published'])
+@pytest.mark.parametrize('name', ['rl', 'rl_any', 'rl_published'])
 def test_a_shipped_policy_of_a_version_that_covered_every_value_is_valid(name):
     network = PolicyNetwork(f'policies/{name}.onnx', ROBOT)
     assert network.contract.robot_hash == robot_hash(ROBOT)

@@ -4,13 +4,12 @@ from pathlib import Path
 import sys
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.schema import flatten, ParameterError
+from beetle_omni_ros.model.schema import ParameterError
 
 ROBOT = RobotParameters.load()
 ROOT = Path(__file__).resolve().parents[2]
@@ -87,17 +86,6 @@ def test_every_shipped_controller_is_built_and_satisfies_the_protocol():
             controller = entry.make(ROBOT)
             assert entry.name == name and entry.reference == name and entry.description
             assert hasattr(controller, 'set_health') == entry.flies_degraded
-
-
-def test_the_corrected_nmpc_differs_from_the_published_one_in_one_weight(tmp_path):
-    entry, published = map(registry.find, ('nmpc_corrected', 'nmpc_published'))
-    pairs = zip(flatten(entry.load_parameters()), flatten(published.load_parameters()),
-                strict=True)
-    assert [(name, value, other) for (name, *_, value), (*_, other) in pairs
-            if not np.array_equal(value, other)] == [('weights.tilt', 20.0, 2.0)]
-    (tmp_path / 'own.yaml').write_text('weights: {tilt: 5.0}')
-    own = entry.load_parameters(ControllerOptions(parameters=tmp_path / 'own.yaml'))
-    assert own.weights.tilt == 5.0      # a user's file takes precedence
 
 
 def test_a_class_is_found_by_module_and_by_file_under_its_own_name(module, tmp_path):

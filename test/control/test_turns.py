@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.control.turns import level_between, route, ROUTED
+from beetle_omni_ros.control.guidance import level_between, route, ROUTED
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.parameters import RobotParameters
 

@@ -2,7 +2,6 @@
 
 import json
 import sys
-import time
 
 import pytest
 
@@ -17,8 +16,7 @@ from servo_bench import running
 from beetle_omni_ros import cli
 from beetle_omni_ros.bags.messages import Diagnostic
 from beetle_omni_ros.drivers import device_checks, motor_board
-from beetle_omni_ros.drivers.check import run_check
-from beetle_omni_ros.drivers.findings import ObservedGraph
+from beetle_omni_ros.drivers.check import ObservedGraph, run_check
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
@@ -223,8 +221,8 @@ def test_a_silent_or_foreign_board_ends_the_checks(emulated, monkeypatch):
         found = board_with(emulated, {'motor board': 'fail'}, seconds=0.5)
     assert 'another device' in found['motor board'].remedy
     emulated.faults.drop_out = 1.0
-    time.sleep(0.1)     # a frame may be under way
-    found = board(emulated.port, seconds=0.5)
+    found = repeated(lambda: board(emulated.port, seconds=0.5),     # a frame may be under way
+                     lambda found: '0 bytes' in found['motor board'].found)
     assert list(found) == ['board port', 'motor board']
     assert '0 bytes' in found['motor board'].found
     emulated.unplug()

@@ -1,4 +1,4 @@
-"""The driver against the emulated board, in Python and in C, over a pseudo-terminal."""
+"""The driver against the emulated board over a pseudo-terminal."""
 
 import os
 import pty
@@ -13,17 +13,10 @@ pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
 from board_bench import connected, driver, flying, HOVER, opened, QUICK, until
-from c_board import CFirmware
 
 from beetle_omni_ros.drivers import mavlink
-from beetle_omni_ros.sim.emulated.motor_board import BoardFirmware, EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
-
-
-@pytest.fixture(autouse=True, params=[BoardFirmware, CFirmware])
-def firmware(request, monkeypatch):
-    monkeypatch.setattr(EmulatedMotorBoard, 'firmware_type', request.param)
 
 
 def test_refused_arming_is_reported_with_the_reason(monkeypatch):

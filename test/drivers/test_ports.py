@@ -14,7 +14,7 @@ import serial
 from serial.tools import list_ports
 
 from beetle_omni_ros.drivers import device_checks as devices
-from beetle_omni_ros.drivers.findings import Findings
+from beetle_omni_ros.drivers.check import Findings
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 
 

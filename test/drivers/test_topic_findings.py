@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.bags.messages import Diagnostic
-from beetle_omni_ros.drivers.findings import check_topics, ObservedGraph, Stream
+from beetle_omni_ros.drivers.check import check_topics, ObservedGraph, Stream
 
 
 def stream(rate, age, jitter=0.001, size=9.81, seconds=3.0, seed=0):

@@ -20,7 +20,7 @@ def made(task, duration=None):
     """Result of one made-up flight of a task, cut off after ``duration`` [s]."""
     flown = make_task(task)
     recorder = LogRecorder({'task': task, 'seed': 0})
-    fly(recorder, flown, controller='nmpc', duration=duration)
+    fly(recorder, flown, controller='nmpc', duration=duration, tick=0.02)
     log = recorder.log()
     judged = metrics(log, flown)
     return {'failure': None, 'metrics': json.loads(json.dumps(judged)), 'trace': trace(log, flown),

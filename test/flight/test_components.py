@@ -26,10 +26,10 @@ from beetle_omni_ros.flight.loop import FlightLoop
 from beetle_omni_ros.flight.stack import ControllerComponent, Estimator, SupervisorComponent
 from beetle_omni_ros.flight.surroundings import SimulatedRobot, TaskReference
 from beetle_omni_ros.model.allocation import ActuatorHealth
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.mode import COMMAND_AGE, Mode
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.readings import ImuReading, JointReading, PoseReading
+from beetle_omni_ros.model.rotations import BodyState
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.simulator import Simulator
 from beetle_omni_ros.supervisor.interface import SupervisorParameters
@@ -222,22 +222,6 @@ def test_an_exception_of_a_controller_is_logged_once_a_second_and_reported(follo
 @pytest.fixture
 def supervisor():
     return Desk(SupervisorComponent(SupervisorParameters.load(), ROBOT, ('nmpc', 'rl')), 10.0)
-
-
-def test_the_supervisor_refuses_to_arm_with_the_reason_of_bridges_or_estimator(supervisor):
-    def refusal():
-        answer = supervisor.component.services['arm']()
-        assert not answer and supervisor.values('supervisor/state') == ['disarmed']
-        return answer.text
-
-    assert 'ekf_node' in refusal()
-    supervisor.component.feed('rotor_bridge/state', 'waiting: battery low')
-    supervisor.component.feed('joint_bridge/state', 'lost: gimbal3 silent')
-    assert refusal() == 'arm refused: joint_bridge_node lost: gimbal3 silent; rotor_bridge_node ' \
-                        'waiting: battery low'
-    for name in ('joint', 'rotor'):
-        supervisor.component.feed(f'{name}_bridge/state', 'ready')
-    assert 'no fresh state estimate' in refusal()
 
 
 def test_the_supervisor_signs_its_commands_and_sends_each_once(supervisor):

@@ -58,9 +58,9 @@ def without_times(results):
 
 
 def test_a_seed_gives_the_same_numbers_and_another_seed_others(poses, flown):
-    first, (again, other) = flown[0], (evaluate(poses, seed=seed) for seed in (3, 4))
-    assert json.dumps(without_times(first)['nmpc']) == json.dumps(without_times(again)['nmpc'])
-    assert first['nmpc']['mean'] != other['nmpc']['mean']
+    first, (again, other) = flown[0], (evaluate(poses, ('hover',), seed=seed) for seed in (3, 4))
+    assert json.dumps(without_times(first)['hover']) == json.dumps(without_times(again)['hover'])
+    assert first['hover']['mean'] != other['hover']['mean']
 
 
 def test_the_json_has_the_keys_of_the_interface(flown):
@@ -125,16 +125,6 @@ def test_an_exception_in_flight_falls_back_and_is_in_the_results(tmp_path):
     assert results['controller_error'].startswith(
         "controller 'bad': step raised AttributeError: 'Bad' object has no attribute 'absent' "
         '(bad.py:10)')
-
-
-def test_a_controller_that_fails_all_the_time_fails_the_command(poses, tmp_path, capsys):
-    bad = own(tmp_path, """if target.position[2] == 1.1:       # of the task
-    raise ValueError("bad")""", 'Bad')
-    result = tmp_path / 'result.json'
-    assert run(result, bad, poses) == 1
-    assert '0 of 1, 1 in fallback' in capsys.readouterr().out
-    results = json.loads(result.read_text())['bad']
-    assert results['success_rate'] == 0 and not results['crashed'] and results['controller_error']
 
 
 @pytest.fixture

@@ -53,6 +53,7 @@ def test_the_command_flies_both_files_after_a_named_effect_alone(tmp_path, monke
     made = json.loads((tmp_path / 'made' / 'improve.json').read_text())
     if verdict == 'no_gap':
         assert made['controllers'] == {} and 'nothing to fly' in shown.output
+        assert not (tmp_path / 'made' / 'robot.yaml').exists()      # that of an earlier run
         return
     assert made['controllers']['rl']['ratio']['U_position_m'] < 0.5
     assert made['controllers']['rl']['after']['reached'] == 2

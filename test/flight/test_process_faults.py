@@ -8,10 +8,10 @@ import pytest
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.flight.component import Component
 from beetle_omni_ros.flight.loop import Loop, QUEUE
-from beetle_omni_ros.flight.process_faults import ProcessFaults
+from beetle_omni_ros.flight.stack import ProcessFaults
 from beetle_omni_ros.flight.surroundings import SimulatedRobot
-from beetle_omni_ros.model.body import BodyState
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.rotations import BodyState
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.simulator import Simulator
 

@@ -168,5 +168,5 @@ def test_a_wind_is_recovered_in_world_axes(made):
 
 def test_every_body_effect_is_tested():
     asked = {name.partition('.')[0] for name in CASES} | {
-        'wind', 'inertia', 'centre_of_mass'}     # the last two: test_dynamics
+        'wind', 'inertia', 'centre_of_mass', 'formula'}  # the last: test_dynamics, test_formula
     assert asked >= {name for name, effect in CATALOGUE.items() if effect.apply}

@@ -12,7 +12,8 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc import NmpcParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.identify.flights.keys import number_of
+from beetle_omni_ros.identify.flights.body import BodyModel
+from beetle_omni_ros.identify.flights.keys import all_keys, extra_keys, number_of
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.model import dynamics
 from beetle_omni_ros.model.allocation import Allocator
@@ -36,7 +37,7 @@ def with_effect(name):
         else:
             values[parameter] = np.array(spec.neutral) + size.typical
     return replace(ROBOT, effects={name: {
-        key: tuple(value.tolist()) if np.ndim(value) else float(value)
+        key: tuple(np.asarray(value).tolist()) if np.ndim(value) else float(value)
         for key, value in values.items()}})
 
 
@@ -136,10 +137,14 @@ def flight_model():
 
 def gap(name):
     """Whether a key of the effect changes the residual."""
-    made = flight_model()
+    made, own = flight_model(), KEYS
+    if CATALOGUE[name].each == 'term':      # of the terms that a robot has
+        robot = replace(with_effect(name), multibody=None)
+        own = {**all_keys(robot), **extra_keys()}
+        made = model(Motion(duration=10.0).flight(), robot, BodyModel(robot, own, (0, 0)), own)
     limit = TREATMENTS[name].limit     # beyond this calm flight
     theta = {key.name: np.log(1e-5 if limit else 1 - key.typical) if key.relative
-             else key.typical for key in KEYS.values() if key.effect == name and not key.form}
+             else key.typical for key in own.values() if key.effect == name and not key.form}
     before, after = made.residual({}), made.residual(theta)
     return any(not np.array_equal(before[group], after[group]) for group in before)
 

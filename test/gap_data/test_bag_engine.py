@@ -19,28 +19,28 @@ from beetle_omni_ros.model.parameters import RobotParameters
 P, ROBOT = GapParameters.load(), RobotParameters.load()
 
 
-def flights(folder, seed, *effects, duration=40.0, **more):
+def flights(folder, seed, *effects, duration=40.0, fit=2, holdout=0, **more):
+    """Prepared flights of one case, the held-out ones last."""
     case = Case('singles' if effects else 'none', 'hard', seed, effects, duration=duration,
-                gust=True, multibody=True, tolerance=True, **more)
+                gust=True, multibody=True, tolerance=True, fit=fit, holdout=holdout, **more)
     made = make_case(case, folder / 'flights', folder / 'sealed')
-    return [prepare(read_recording(made / name), ROBOT, P)
-            for name in ('fit_1', 'fit_2', 'holdout_1')]
+    return [prepare(read_recording(path), ROBOT, P) for path in sorted(made.glob('*_?'))]
 
 
 def names(result):
     return [name for effect in result['effects'] for name in effect['names']]
 
 
-@pytest.mark.parametrize('seed, more', [
-    (5, {}), (952385194, {'conditions': 'published', 'duration': 60.0})])
-def test_feedback_of_gusts_in_a_smooth_task_is_no_effect(tmp_path, seed, more):
-    result = judged(flights(tmp_path, seed, course='lemniscate', **more)[:2], [], ROBOT, P)
+def test_feedback_of_gusts_in_a_smooth_task_is_no_effect(tmp_path):
+    smooth = flights(tmp_path, 952385194, course='lemniscate', conditions='published',
+                     duration=60.0)
+    result = judged(smooth, [], ROBOT, P)
     assert names(result) == [] and result['false_alarm_probability'] > 0.05
 
 
 def test_a_late_mocap_is_named_although_it_is_noisy(tmp_path):
     late = flights(tmp_path, 5, ('mocap_time_offset', 0.015, 'plain'), course='lemniscate',
-                   conditions='published')[:2]
+                   conditions='published')
     result = judged(late, [], ROBOT, P)
     assert names(result) == ['mocap_time_offset']
     low, high = result['effects'][0]['parameters']['delay']['interval']
@@ -48,7 +48,8 @@ def test_a_late_mocap_is_named_although_it_is_noisy(tmp_path):
 
 
 def test_a_hidden_effect_is_named_though_the_sensors_differ_from_flight_to_flight(tmp_path):
-    rng, made = np.random.default_rng(1), flights(tmp_path, 6, ('rotor_drag', 0.6, 'plain'))
+    rng, made = np.random.default_rng(1), flights(
+        tmp_path, 6, ('rotor_drag', 0.6, 'plain'), holdout=1)
     made = [replace(
         flight,
         times=flight.times | {topic: flight.times[topic] + rng.uniform(-0.008, 0.008)
@@ -65,9 +66,15 @@ def test_a_hidden_effect_is_named_though_the_sensors_differ_from_flight_to_fligh
     assert any('joint feedback delay differs' in finding for finding in result['findings'])
 
 
-def test_gains_loads_and_inertia_of_a_servo_have_one_common_factor(tmp_path):
+def one_flight(folder, **more):
+    """The engine's model of one short flight."""
     keys = {**all_keys(ROBOT), **extra_keys()}
-    made = BagFlight(flights(tmp_path, 7)[0], ROBOT, BodyModel(ROBOT, keys, (0.0, 0.0)), keys, P)
+    flight, = flights(folder, 7, duration=20.0, fit=1, **more)
+    return BagFlight(flight, ROBOT, BodyModel(ROBOT, keys, (0.0, 0.0)), keys, P)
+
+
+def test_gains_loads_and_inertia_of_a_servo_have_one_common_factor(tmp_path):
+    made = one_flight(tmp_path)
     made.modules = 1.0
     factor = ['joint_bandwidth.kp', 'joint_bandwidth.kd', 'swing.ratio', 'modules.share']
     slopes = made.linear({}, factor).slopes[:, 12:]
@@ -75,15 +82,12 @@ def test_gains_loads_and_inertia_of_a_servo_have_one_common_factor(tmp_path):
 
 
 def test_slopes_agree_with_differences_of_the_residual(tmp_path):
-    keys = {**all_keys(ROBOT), **extra_keys()}
-    # without noise, which the slopes must not explain
-    made = BagFlight(flights(tmp_path, 7, noise=0.0)[0], ROBOT,
-                     BodyModel(ROBOT, keys, (0.0, 0.0)), keys, P)
+    made = one_flight(tmp_path, noise=0.0)      # which the slopes must not explain
     some = ['mass.mass', 'imu_misalignment.rotation[1]', 'mocap_time_offset.delay',
             'imu_filter_lag.delay', 'joint_command_latency.delay', 'rotor_lag.time_constant']
     linear = made.linear({}, some)
     for k, name in enumerate(some):
-        step = 0.3 * keys[name].smallest
+        step = 0.3 * made.keys[name].smallest
         ahead, behind = (made.linear({name: s * step}, []).residual for s in (1, -1))
         slope = (ahead - behind) / (2 * step)
         assert np.abs(slope - linear.slopes[..., k]).max() < 0.1 * np.abs(slope).max()

@@ -12,7 +12,7 @@ from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
 from beetle_omni_ros.identify.rotor.results import identify_rotor, rotor_results
 from beetle_omni_ros.model.files import LogError
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.thrust_map import ThrustMap
+from beetle_omni_ros.model.parts import ThrustMap
 
 DATA = Path(__file__).resolve().parents[3] / 'shared' / 'data'
 STAND = (*HEADER, 'temperature', 'file_voltage')

@@ -28,7 +28,7 @@ def states(count=200, seed=0):
 
 @pytest.mark.parametrize('kind', KINDS)
 def test_numpy_casadi_torch_and_c_take_the_same_step(kind):
-    from beetle_omni_ros.train.physics import torch_function
+    from beetle_omni_ros.train.model import torch_function
     target, tilt, rate, load = states()
     expected = np.array(Step(NUMPY, KINDS[kind], 0.001)(target, tilt, rate, load))
     names = ca.SX.sym('x', 4)

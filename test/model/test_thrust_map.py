@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.parts import RotorMapRow
+from beetle_omni_ros.model.parts import duty_of_command, FULL_DUTY, RotorMapRow, ThrustMap
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.model.thrust_map import duty_of_command, FULL_DUTY, ThrustMap
 
 ROTORS = RobotParameters.load().rotors
 MAP = ThrustMap(ROTORS)

@@ -2,52 +2,18 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.flight import component as base
-from beetle_omni_ros.model.body import BodyState
-from beetle_omni_ros.model.readings import JointReading
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.ros import graph
-from beetle_omni_ros.ros.control_nodes import SupervisorNode
+from beetle_omni_ros.ros.nodes import SupervisorNode
 from beetle_omni_ros.ros.runner import maker
 
-LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
 OWN, OBSERVER = (f'{EXAMPLES}/own_controller.py:PoseController',
                  f'{EXAMPLES}/own_component.py:WrenchObserver')
-FAILING = """from beetle_omni_ros.control.hover import HoverController
-
-
-class Failing(HoverController):
-    def step(self, state, target):
-        if state.stamp > 1.5:
-            state.positon
-        return super().step(state, target)
-"""
-
-
-def test_an_exception_of_step_is_logged_and_reported_and_publishes_no_command(
-        make, tmp_path, capfd):
-    own = tmp_path / 'bad.py'
-    own.write_text(FAILING)
-    component, sent = make(maker(f'{own}:Failing')).component, []
-    component.send = lambda topic, value: sent.append(value.stamp)
-    component._on_joints(JointReading(1.0, np.zeros(4), np.zeros(4)))
-    for stamp in (1.0, 2.0, 2.1):
-        component._on_odom(BodyState(
-            stamp, np.array([0, 0, 1.0]), np.zeros(3), LEVEL, np.zeros(3)))
-    error = "controller 'failing': step raised AttributeError: 'State' object has no attribute " \
-            "'positon' (bad.py:7)"
-    level, text, values = component._controller_status()
-    assert (level, text, values['errors']) == (base.ERROR, error, 2)
-    assert component._controller_status()[0] == base.OK      # none since the last report
-    assert sent == [1.0]
-    lines = [line for line in capfd.readouterr().err.splitlines() if 'ERROR' in line]
-    assert len(lines) == 1 and lines[0].endswith(error)     # at most one a second
 
 
 def test_the_supervisor_selects_among_the_listed_controllers(make):

@@ -1,8 +1,9 @@
 """joint_bridge_node as a process with emulated servos; test/drivers has the faults of the bus."""
 
-from bridge_bench import COUNT, JOINT, running_bridge
+from bridge_bench import COUNT, JOINT, running_bridge, WITHIN
 import pytest
 
+from beetle_omni_ros.drivers.servo_guard import HOLD
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
 pytestmark = pytest.mark.real_time
@@ -35,7 +36,8 @@ def test_transitions_switch_port_and_torque_and_commands_move_the_joints(tmp_pat
         assert not emulated.torque_enabled.any()
 
 
-def test_a_composed_bridge_waits_for_its_port_and_reports_why(tmp_path):
+def test_a_composed_bridge_waits_for_its_port_and_its_servos_lose_torque_after_it_is_killed(
+        tmp_path):
     port = tmp_path / 'servo_bus'
     with running_bridge(tmp_path, JOINT, ['ekf_node'], port=str(port), autostart='activate') \
             as (graph, operator):
@@ -46,8 +48,9 @@ def test_a_composed_bridge_waits_for_its_port_and_reports_why(tmp_path):
             emulated.faults.silent = set()
             operator.reaches('ready')
             assert emulated.torque_enabled.all()
-            graph.stop()
-            assert not emulated.torque_enabled.any()
+            graph.kill(JOINT)       # the guard holds the torque for a landing
+            assert emulated.torque_enabled.all()
+            assert operator.wait(lambda: not emulated.torque_enabled.any(), HOLD + WITHIN)
         log = graph.log(JOINT).read_text()
         assert log.count('no such port') <= 2, 'an attempt a second, but not a line'
         assert 'Traceback' not in log

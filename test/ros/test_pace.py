@@ -10,7 +10,7 @@ from synthetic_flights import fly
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.bags.bag_writer import BagWriter
 from beetle_omni_ros.ros import fly as fly_module
-from beetle_omni_ros.ros import pace
+from beetle_omni_ros.ros import fly as pace
 from beetle_omni_ros.ros.graph import plan
 
 

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from beetle_omni_ros.model.schema import group, parameter
-from beetle_omni_ros.ros import parameters
+from beetle_omni_ros.ros import node as parameters
 
 
 @dataclass(frozen=True, kw_only=True)

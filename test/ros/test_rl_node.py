@@ -5,17 +5,10 @@ import pytest
 from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.ros.graph import controller_nodes
-from beetle_omni_ros.ros.runner import maker
 
 pytest.importorskip('onnx')
 
 from policy_files import write
-
-
-def test_the_executable_flies_the_given_policy(make, tmp_path):
-    node = make(maker('rl_node'), f"policy:={write(tmp_path / 'policy.onnx', bias=[0.1] * 8)}")
-    assert node.parameters.policy.endswith('policy.onnx')
-    assert node.component._controller_status()[2]['policy'] == 'rl'
 
 
 def test_files_reach_their_nodes_and_a_shipped_policy_that_cannot_fly_is_left_out(

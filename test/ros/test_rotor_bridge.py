@@ -13,6 +13,7 @@ pytest.importorskip('serial')
 
 from bridge_bench import QUICK, ROTOR, running_bridge, WITHIN
 
+from beetle_omni_ros.drivers.mavlink import BOARD, HOST, MavlinkReceiver
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard, NUMBERS
 
 pytestmark = pytest.mark.real_time
@@ -70,18 +71,31 @@ def test_the_bridge_arms_at_takeoff_follows_thrusts_and_disarms_with_the_supervi
         assert not made.graph.dead()
 
 
+def arrivals_at(board):
+    """List of (arrival [s], stamp [us]) of the targets from now on."""
+    receiver, serve, arrivals = MavlinkReceiver(*HOST), board.firmware.serve, []
+
+    def listening(data, now):
+        arrivals.extend((now, message.time_usec) for message in receiver.feed(data)
+                        if message.get_type() == 'SET_ACTUATOR_CONTROL_TARGET')
+        return serve(data, now)
+
+    board.firmware.serve = listening
+    return arrivals
+
+
 def repeats_commands_until_they_are_old(flying):
-    board, operator, arrivals = flying.board, flying.operator, []
+    board, operator = flying.board, flying.operator
     operator.period = 0.06
-    board.firmware.on_target = lambda now, stamp: arrivals.append((now, stamp))
+    arrivals = arrivals_at(board)
     operator.until(lambda: len(arrivals) > 60)
     stamps = [stamp for _, stamp in arrivals]
     assert stamps == sorted(stamps) and len(stamps) > 3 * len(set(stamps))
     operator.thrust = None
     # 100 ms after the last new target, however often it was repeated.
     operator.until(lambda: not board.commands.any())
-    newest = next(now for now, stamp in arrivals if stamp == arrivals[-1][1])
-    assert board.firmware.timeouts and board.firmware._target_at == newest
+    stopped = time.monotonic()
+    assert board.firmware.timeouts and stopped < arrivals[-1][0] + NUMBERS['target_timeout']
     flying.follow(HOVER)
     operator.age = 0.2
     operator.until(lambda: not board.commands.any())
@@ -92,9 +106,9 @@ def repeats_commands_until_they_are_old(flying):
 
 def test_after_a_killed_bridge_no_rotor_turns_and_a_new_one_does_not_arm(tmp_path):
     with bench(tmp_path) as made:
-        board, operator, arrivals = made.board, made.operator, []
+        board, operator = made.board, made.operator
         made.take_off()
-        board.firmware.on_target = lambda now, stamp: arrivals.append(now)
+        arrivals = arrivals_at(board)
         operator.until(lambda: arrivals)
         made.graph.kill(ROTOR)
         looked, turning = time.monotonic(), 0.0
@@ -102,7 +116,7 @@ def test_after_a_killed_bridge_no_rotor_turns_and_a_new_one_does_not_arm(tmp_pat
             turning, looked = looked, time.monotonic()
             time.sleep(0.001)
         # They turned at `turning` or later, also on a busy computer.
-        assert turning < arrivals[-1] + NUMBERS['target_timeout']
+        assert turning < arrivals[-1][0] + NUMBERS['target_timeout']
         made.stops()
         operator.supervise('flying:nmpc')
         made.graph.start_process(ROTOR)
@@ -138,4 +152,8 @@ def test_without_autostart_it_arms_only_while_activated_and_disarms_at_its_end(t
         made.graph.processes[ROTOR].send_signal(signal.SIGTERM)
         operator.reaches('lost: the bridge has stopped')
         assert made.graph.processes[ROTOR].wait(WITHIN) == 0
-        assert not board.armed and board.firmware._stop_reason == 1    # requested by the host
+        with board._lock:
+            heartbeat, *_ = MavlinkReceiver(*BOARD).feed(b''.join(
+                board.firmware.serve(b'', time.monotonic() + 0.25)))
+        assert not board.armed
+        assert heartbeat.custom_mode >> 8 & 0xFF == 1       # requested by the host

@@ -11,8 +11,7 @@ from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.parameters import JOINT_NAMES
 from beetle_omni_ros.show.figures import COLOURS
-from beetle_omni_ros.show.live import draw
-from beetle_omni_ros.show.recorded import recorded_scene
+from beetle_omni_ros.show.recorded import draw, recorded_scene
 from beetle_omni_ros.show.scene import close, moments, NEWTON_PER_METRE, Room, serve
 
 

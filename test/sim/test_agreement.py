@@ -43,7 +43,7 @@ EFFECTS = {
 }
 EFFECTS['all'] = {name: values for each in EFFECTS.values() for name, values in each.items()}
 SERVOS = {'joint_deflection': {'deflection_per_newton': 0.002}}
-NOT_COMPARED = {'joint_friction', 'module_reaction'}    # see above
+NOT_COMPARED = {'joint_friction', 'module_reaction', 'formula'}     # see above; one equation
 VOLTAGE_RATIO = 0.87
 LOW, HIGH = 0.6, 10.0       # [m], the lower in reach of the ground effect
 

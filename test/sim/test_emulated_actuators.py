@@ -5,7 +5,7 @@ import pytest
 from sim_robots import HIGH, ROBOT, WORLD
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
+from beetle_omni_ros.sim.emulated.device import EmulatedActuators
 from beetle_omni_ros.sim.simulator import Simulator
 
 HOVER = ROBOT.hover_thrust

@@ -5,7 +5,7 @@ import pytest
 
 from beetle_omni_ros.model.allocation import Allocator
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.thrust_map import ThrustMap
+from beetle_omni_ros.model.parts import ThrustMap
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.sensors import VOLTAGE_NOISE
 from beetle_omni_ros.sim.simulator import Battery

@@ -95,17 +95,6 @@ def test_fallback_and_landing_start_from_the_joints_and_not_from_a_far_target(be
     assert np.abs(rig.command.tilt - joints).max() < 0.6
 
 
-def test_a_controller_whose_commands_are_not_finite_loses_control_with_the_reason():
-    rig = flown()
-    rig.alive.discard('nmpc')
-    bad = Command(rig.now, np.full(4, np.nan), np.ones(4))
-    rig.supervisor.inputs.on_command('nmpc', bad, rig.now)
-    rig.run(TIMEOUT)
-    assert rig.supervisor.state == 'fallback'
-    assert any('last refused: not finite' in text for text in rig.texts('error'))
-    assert rig.supervisor.diagnostics()['nmpc.refused.not finite'] == 1
-
-
 @pytest.mark.parametrize('late, text', [('nmpc', 'nmpc_node late: median age 30 ms'),
                                         ('estimate', 'ekf_node late: median age 30 ms')])
 def test_late_commands_or_estimates_prevent_arming_with_the_reason(late, text):

@@ -23,10 +23,10 @@ QUIET = {f'random.{name}': 0.0 for name in (
     'attitude_bias', 'attitude_noise', 'velocity_bias', 'velocity_noise', 'rate_bias',
     'rate_noise', 'tilt_bias', 'tilt_noise', 'force_share', 'strong_share', 'payload_share',
     'push_share', 'carried_share', 'estimated_force_bias', 'estimated_force_noise',
-    'estimated_torque_bias', 'estimated_torque_noise', 'late_share', 'jitter')} | {
+    'estimated_torque_bias', 'estimated_torque_noise')} | {
     'random.velocity_latency': [0.0, 0.0], 'random.tilt_latency': [0.0, 0.0],
     'random.command_latency': [0.01, 0.01], 'random.actuator_spread': [0.0, 0.0],
-    'random.friction_scale': [1.0, 1.0], 'random.thrust_limit': [20.0, 20.0]}
+    'random.thrust_limit': [20.0, 20.0]}
 
 
 def small(changes=None, **more):

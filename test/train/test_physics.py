@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from beetle_omni_ros.model.effects import CATALOGUE, validated
-from beetle_omni_ros.train import model, physics
+from beetle_omni_ros.train import model
 
 EFFECTS = validated({
     'mass': {'mass': 3.3}, 'inertia': {'inertia': [0.08, 0.07, 0.11]},
@@ -25,7 +25,9 @@ EFFECTS = validated({
     'ground_effect': {'gain_at_0.25m': 0.08},
     'propeller_gyroscopic_torque': {'angular_momentum_at_hover': 0.06},
     'rotor_acceleration_torque': {'angular_momentum_at_hover': 0.03},
-    'joint_offset': {'offset': [0.03, -0.02, 0.05, 0.0]}})
+    'joint_offset': {'offset': [0.03, -0.02, 0.05, 0.0]},
+    'formula': {'expressions': ['force: velocity * speed', 'rotor_torque: turning * spin * thrust',
+                                'thrust: thrust * ground'], 'coefficients': [-0.1, 0.03, 0.2]}})
 EVERYTHING = replace(ROBOT, effects=EFFECTS)
 
 
@@ -53,7 +55,7 @@ def test_torch_agrees_with_casadi(robot):
                             if effect.apply and name != 'voltage_sag'}   # needs a voltage
     function = model.substep(robot, 0.0025)
     inputs = states(200)
-    ours = physics.torch_function(function)(*inputs).numpy()
+    ours = model.torch_function(function)(*inputs).numpy()
     theirs = np.array(function.map(200)(*(value.numpy().T for value in inputs))).T
     assert ours.dtype == np.float64
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-10)
@@ -70,13 +72,13 @@ def test_every_operation_of_the_tables_is_correct_with_constants_too():
     function = ca.Function('sample', [x, y], [out], ['x', 'y'], ['z'])
     rng = np.random.default_rng(1)
     x, y = rng.normal(size=(60, 2)), rng.uniform(0.1, 2, (60, 2))
-    ours = physics.torch_function(function)(torch.tensor(x), torch.tensor(y)).numpy()
+    ours = model.torch_function(function)(torch.tensor(x), torch.tensor(y)).numpy()
     np.testing.assert_allclose(ours, np.array(function.map(60)(x.T, y.T)).T, atol=1e-14)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='triton compiles for a GPU')
 def test_the_kernel_agrees_with_torch():
-    made = physics.Physics(EVERYTHING, 0.01, 4, 'cuda')
+    made = model.Physics(EVERYTHING, 0.01, 4, 'cuda')
     x, _, wrench, body = (value.cuda() for value in states(1000, 3, torch.float32))
     commands = [states(1000, seed, torch.float32)[1].cuda() for seed in (4, 5, 6)]
     delays = uniform(torch.Generator().manual_seed(7), 0.0, 0.02, 1000, 2).cuda()

@@ -135,33 +135,6 @@ def test_slower_actuators_have_more_damping_and_lag_alone():
     assert (ratio == 1.0).all()
 
 
-def test_late_robots_have_their_share_and_range():
-    env = quiet({'random.late_share': 0.4, 'random.tilt_latency': [0.01, 0.01],
-                 'random.late_commands': 0.03, 'random.late_tilts': 0.02}, robots=4000)
-    delays = env.state['delays'] - 0.01
-    assert (delays[:, 0] == delays[:, 1]).all()
-    for more, most in ((delays[:, 0], 0.03), (delays[:, 3], 0.02)):
-        late = more > 1e-6
-        assert float(late.float().mean()) == pytest.approx(0.4, abs=0.03)
-        assert float(more[late].mean()) == pytest.approx(most / 2, rel=0.06)
-        assert 0.98 * most < float(more.max()) <= most + 1e-6
-    both = (delays[:, 0] > 1e-6) & (delays[:, 3] > 1e-6)
-    assert float(both.float().mean()) == pytest.approx(0.16, abs=0.03)      # independent
-    late = (delays[:, 0] > 1e-6) | (delays[:, 3] > 1e-6)
-    assert torch.equal(env.state['disturbed'][:, 0] > 0.5, late)    # neither judged nor replayed
-
-
-def test_some_servos_have_no_friction():
-    changes = {'random.actuator_spread': [1.0, 1.0]}
-    whole, less = (quiet({**changes, 'random.friction_scale': span}, robots=2000).state['body']
-                   for span in ([1.0, 1.0], [-0.5, 1.0]))
-    ratio = less[:, 15:23] / whole[:, 15:23]
-    torch.testing.assert_close(ratio, ratio[:, :1].expand(-1, 8))
-    assert float((ratio[:, 0] == 0).float().mean()) == pytest.approx(1 / 3, abs=0.04)
-    assert float(ratio.max()) <= 1.0001
-    torch.testing.assert_close(less[:, 7:15], whole[:, 7:15])
-
-
 def test_drawn_actuators_are_those_of_robots_that_the_robot_file_draws():
     rng, file = np.random.default_rng(0), RobotParameters.load('measured')
     drawn = torch.tensor(np.array([actuators(file.drawn(rng)) for _ in range(DRAWN)])).float()

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-import re
 import shutil
 
 import learning  # noqa: F401
@@ -13,10 +12,7 @@ from beetle_omni_ros import cli
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.resources import share_path
-from beetle_omni_ros.model.schema import flatten
-from beetle_omni_ros.train import command
-from beetle_omni_ros.train.command import parse_changes
+from beetle_omni_ros.train import runner
 from beetle_omni_ros.train.parameters import read_parameters, TrainParameters
 from beetle_omni_ros.train.ppo import GraphPpo
 
@@ -50,26 +46,12 @@ def test_a_run_writes_all_documented_files(run):
     result = json.loads((run.parent / 'result.json').read_text())
     assert result['policy'] == str(run / 'policy.onnx') and result['iterations'] == 3
     assert result['onnx_difference'] <= 1e-5 and result['seconds'] > 0
-    expected = read_parameters(None, {**command.SMOKE, 'seed': 5})
+    expected = read_parameters(None, {**runner.SMOKE, 'seed': 5})
     assert TrainParameters.load(run / 'train.yaml').plain() == expected.plain()
 
 
 def test_the_shipped_parameters_are_the_defaults():
     assert TrainParameters.load().plain() == TrainParameters().plain()
-
-
-def test_the_published_training_has_the_published_values_and_no_own_term():
-    published = TrainParameters.load(share_path('params/train_published.yaml'))
-    usual, documented = TrainParameters().plain(), 0
-    for name, entry, _, value in flatten(published):
-        doc = entry.metadata['doc']
-        if found := re.search(r'\bpublished( -[\d.e-]+)?', doc):
-            np.testing.assert_array_equal(value, float(found[1]) if found[1]
-                                          else usual[name], name)
-            documented += 1
-        elif doc.startswith('own: '):
-            assert value == 0 or name == 'reward.termination', name
-    assert documented == 20
 
 
 def test_the_policy_of_a_run_flies(run):
@@ -140,8 +122,3 @@ def test_another_run_is_not_overwritten(capsys, run):
     line = refused(capsys, *TINY, '--output', run)
     assert 'holds the checkpoints of another run' in line and f'--resume {run}' in line
     assert sorted(run.iterdir()) == before
-
-
-def test_changes_are_parsed_as_yaml():
-    found = parse_changes(['a.b=1e-3', 'c=[1, 2]', 'd = true'], seed=3, memory=None)
-    assert found == {'a.b': 1e-3, 'c': [1, 2], 'd': True, 'seed': 3}

@@ -22,7 +22,11 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
     effects = {name: dict(values) for name, values in robot.effects.items()}
     for effect in named:
         name = effect['names'][0]
-        member = effect.get('rotor') or effect.get('joint')
+        if 'expressions' in effect:     # a formula that was learned
+            effects[name] = {'expressions': effect['expressions'], 'coefficients': [
+                rounded(found['value']) for found in effect['parameters'].values()]}
+            continue
+        member = effect.get('rotor') or effect.get('joint') or effect.get('term')
         values = effects.setdefault(name, {})
         for parameter, found in effect['parameters'].items():
             spec = CATALOGUE[name].parameters[parameter]

@@ -37,10 +37,11 @@ class BodyModel:
         self._x = x = {name: ca.SX.sym(name, width) for name, width in WIDTHS.items()}
         effects: dict[str, dict] = {}
         for name, effect in CATALOGUE.items():
-            if effect.apply is None:
+            if effect.apply is None or effect.each == 'term' and name not in robot.effects:
                 continue
-            effects[name] = {parameter: self._symbol(keys, name, parameter)
-                             for parameter in effect.parameters}
+            effects[name] = {parameter: robot.effects[name][parameter] if spec.text
+                             else self._symbol(keys, name, parameter)
+                             for parameter, spec in effect.parameters.items()}
         if MODULES not in robot.effects:
             share = x['modules']
             own = effects[MODULES]

@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from beetle_omni_ros.bags.bag import names_of, runs_in
 from beetle_omni_ros.identify.flights.apply import write_corrected
+from beetle_omni_ros.identify.flights.learn import FORMULA, learned, write_effect
 from beetle_omni_ros.identify.flights.next_flight import Planner
 from beetle_omni_ros.identify.flights.page import gap_page, grids, headline
 from beetle_omni_ros.identify.flights.results import ALPHA, result_of
@@ -46,6 +47,7 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
                 page: Path | None = None, console: Console | None = None,
                 parameters: Path | None = None, fix: bool = False, tolerances: bool = False,
                 form: str | None = None, alpha: float = ALPHA, next_task: Path | None = None,
+                learn: Path | None = None,
                 experiments: Callable[[RobotParameters], Any] | None = None) -> dict:
     """
     Find differences between model and measurement; arguments of `beetle_omni gap`.
@@ -63,6 +65,7 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
         tolerances: whether ``apply`` has this robot's own numbers, too.
         form: format of tables of flights, by name or file; None: bags or joint logs.
         alpha: probability of a false alarm that is accepted.
+        learn: file of an effect to write, a formula for what no entry explains.
         next_task: task to write, a flight that decides what these left open.
         experiments: makes what flies its manoeuvres, for ``next_task``.
 
@@ -84,8 +87,9 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
     runs, holdout = (list(given) if form else runs_in(given) for given in (runs, holdout))
     check_apart([*runs, *holdout])
     if form is None and any(is_joint_log(run) for run in runs):
-        if next_task:
-            raise ParameterError(f'--next {next_task}: expected flights, not logs of joints')
+        for option, path in (('--next', next_task), ('--learn', learn)):
+            if path:
+                raise ParameterError(f'{option} {path}: expected flights, not logs of joints')
         with console.status('comparing the servos'):
             result, made_page = analyse_joint_logs(runs, holdout, model, robot)
         html = made_page() if page else ''
@@ -94,20 +98,26 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
             if next_task and experiments else None
         # On small matrices, several threads only take more CPU time.
         with console.status('reading') as status, threadpool_limits(1):
-            result = _tables(runs, holdout, model, p, form, alpha, status.update,
-                             then) if form \
-                else _bags(runs, holdout, model, p, fix, alpha, status.update, then)
+            def results(robot, then):
+                return _tables(runs, holdout, robot, p, form, alpha, status.update, then) \
+                    if form else _bags(runs, holdout, robot, p, fix, alpha, status.update, then)
+            result = results(model, then)
+            result = learned(results, model, result) if learn else result
         result['meta'] |= {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                            'robot': str(robot) if robot else 'params/robot.yaml', 'alpha': alpha}
         html = gap_page(result, _damaged(result, [*runs, *holdout])) if page else ''
     write_json(json_path, result)
     if page:
         write_text(page, html, 'page')
+    written = learn if result.get(FORMULA, {}).get('ranges') else None
+    if written:
+        write_effect(written, result, model)
     if apply and result['effects']:
         write_corrected(apply, result, model, robot, tolerances)
     _print(console, result)
-    written = apply if result['effects'] else None
-    print_end(console, (written, page, json_path), ('evaluate', '--robot', written) if written
+    corrected = apply if result['effects'] else None
+    print_end(console, (corrected, written, page, json_path), (
+        'evaluate', '--robot', corrected) if corrected
               else 'no robot file, because no effect is named' if apply else
               'the same with --report FILE writes a page, with --apply FILE a robot file')
     return result

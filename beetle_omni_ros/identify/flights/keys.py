@@ -22,6 +22,7 @@ import numpy as np
 from beetle_omni_ros.identify.flights.treatment import Size, TREATMENTS
 from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.model.effects import CATALOGUE, delaying, ignored
+from beetle_omni_ros.model.formula import size_of as size_of_term
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.terms import EffectParameter
 
@@ -124,7 +125,8 @@ def friction(robot: RobotParameters) -> tuple[np.ndarray, np.ndarray]:
 
 def all_keys(robot: RobotParameters) -> dict[str, Key]:
     """Keys of the whole catalogue with base values of ``robot``, by name."""
-    keys, effects = {}, dict(robot.effects)
+    keys: dict[str, Key] = {}
+    effects = dict(robot.effects)
     if 'joint_friction' in effects:
         effects['joint_friction'] = dict(zip(CATALOGUE['joint_friction'].parameters,
                                              friction(robot), strict=True))
@@ -132,6 +134,9 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
         if name not in TREATMENTS or ignored('gap', name):
             continue
         treatment = TREATMENTS[name]
+        if effect.each == 'term':
+            keys |= _terms(robot, name, treatment.sizes['coefficients'])
+            continue
         # The file's modules load the joints by their share, so this entry is only the excess.
         groups = 'B' if name == MODULES and robot.multibody else treatment.channels
         for parameter, spec in effect.parameters.items():
@@ -146,6 +151,18 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
                                  float(value), relative, size.typical, size.smallest, groups,
                                  effect.apply is not None, size.step, spec.form,
                                  not relative and spec.low == 0.0)
+    return keys
+
+
+def _terms(robot, name, size):
+    """Keys of the terms of a formula; together, narrow ones have the smallest relevant size."""
+    own = robot.effects.get(name, {'expressions': (), 'coefficients': ()})
+    weight, arm = robot.mass * robot.gravity, ARM * size_of(robot, 'm')
+    keys: dict[str, Key] = {}
+    for k, (term, value) in enumerate(zip(*own.values(), strict=True)):
+        typical, text = size_of_term(term, weight, arm), f'{name}.coefficients[{k}]'
+        keys[text] = Key(text, name, 'coefficients', k, value, False, size.typical * typical,
+                         size.smallest * typical / len(own['expressions'])**0.5, 'B', True)
     return keys
 
 
@@ -233,8 +250,7 @@ def prior_of(robot: RobotParameters, key: Key, tolerance: float, stamps: float) 
     plain = f'{key.effect}.{key.parameter}'
     flight = FLIGHT.get(plain, 0.0)
     if plain == 'centre_of_mass.offset':
-        flight = FLIGHT_OFFSET * float(
-            np.linalg.norm(robot.rotors.positions[:, :2], axis=1).mean())
+        flight = FLIGHT_OFFSET * ARM * size_of(robot, 'm')
     if plain == 'rotor_dead_time.delay':
         flight = max(flight, stamps)
     typical = AIR * TREATMENTS['rotor_drag'].sizes['coefficient'].typical if (
@@ -247,8 +263,7 @@ def entries_of(keys: dict[str, Key]) -> list[Entry]:
     result = []
     for name in dict.fromkeys(key.effect for key in keys.values()):
         effect = CATALOGUE[name]
-        own = tuple(key for parameter in effect.numbers for key in names_of(name, parameter)
-                    if key in keys)
+        own = tuple(key for key, at in keys.items() if at.effect == name and not at.form)
         # noise of IMU and MoCap reaches the commands; servos are simulated from commands
         channels = TREATMENTS[name].channels
         body = channels[:1] in 'BAW' and 'J' not in channels

@@ -276,7 +276,7 @@ class Planner:
     path: Path
 
     def __call__(self, engine: Engine, solution: Solution, result: dict,
-                 starts: Starts | None = None) -> dict[str, Any]:
+                 starts: Starts | None = None, judges: Sequence = ()) -> dict[str, Any]:
         """
         Plan a flight, check it, and write it as a task.
 
@@ -286,6 +286,7 @@ class Planner:
             result: of the analysis.
             starts: as of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`; None:
                 flights of tables, whose robot is not simulated.
+            judges: flights that judge, not used.
 
         Returns:
             ``next_flight``: ``task`` (None: none is written), ``sentence``, and of a written one

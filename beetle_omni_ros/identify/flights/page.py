@@ -11,6 +11,7 @@ import numpy as np
 from beetle_omni_ros.identify.recording.bag import Recording
 from beetle_omni_ros.identify.recording.topics import begin_of
 from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.formula import described
 from beetle_omni_ros.show import figures
 from beetle_omni_ros.show.page import ABSENT, Grid, html, page, section, verdict_head
 
@@ -44,7 +45,7 @@ def label(effect: dict) -> str:
     """Names of an effect or candidate with the number of its rotor or joint."""
     if len(effect.get('members', [])) > 1:
         return ' or '.join(effect['members'])
-    member = effect.get('rotor') or effect.get('joint')
+    member = effect.get('rotor') or effect.get('joint') or effect.get('term')
     names = ' or '.join(effect.get('names') or [effect['name']])
     return names + (f' {member}' if member else '')
 
@@ -95,7 +96,7 @@ def _spelled(name):
 def _effect_text(effect):
     several = effect.get('members', [])[1:]
     names = [_spelled(name) for name in (effect['members'] if several else effect['names'])]
-    member = next((f' of {kind} {effect[kind]}' for kind in ('rotor', 'joint')
+    member = next((f' of {kind} {effect[kind]}' for kind in ('rotor', 'joint', 'term')
                    if effect.get(kind) and not several), '')
     parameter, found = next(iter(effect['parameters'].items()))
     values, own = _list(found['value']), _list(found['file'])
@@ -154,8 +155,9 @@ def grids(result: dict, brief: bool = True) -> list[Grid]:
     if brief:
         where = where[:SHOWN]
         groups = {} if all(group['used'] for group in groups.values()) else groups
-    tables = [_damages(result['bad_data']), _effects(result), _gap(result), _channels(where),
-              _groups(groups), evidence(result['candidates'], SHOWN if brief else 0)]
+    tables = [_damages(result['bad_data']), _effects(result), _formula(result), _gap(result),
+              _channels(where), _groups(groups),
+              evidence(result['candidates'], SHOWN if brief else 0)]
     return [grid for grid in tables if grid.rows]
 
 
@@ -179,6 +181,22 @@ def _effects(result):
                 note='95 %: interval that contains the true value in 95 of 100 cases. ln B: '
                      'logarithm of the evidence with the effect over that without it; 3 is 20 to '
                      '1.')
+
+
+def _formula(result):
+    found = result.get('formula', {})
+    if 'ranges' not in found:
+        return Grid('', [], [])
+    rows = []
+    for term, size in result['effects'][-1]['parameters'].items():
+        unit, words, symbols = described(term)
+        rows.append([symbols, words, f"{size['value']:.3g} {unit}", _spans(size['interval'])])
+    where = listed([f'{name} {low:g} to {high:g}'
+                    for name, (low, high) in found['ranges'].items()])
+    return Grid('Formula', ['term', 'in words', 'k', '95 %'], rows, note=(
+        f"Error over noise floor {found['gap_before']:.2f} without it, {found['gap_after']:.2f} "
+        f"with it: closure {found['closure']:.0%}. ln B {found['ln_bayes_factor']:.0f} after the "
+        f"choice among {found['terms_tried']} terms. Determined at {where}."))
 
 
 def _gap(result):

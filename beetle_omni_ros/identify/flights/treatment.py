@@ -110,6 +110,10 @@ TREATMENTS: dict[str, Treatment] = {
         {'exponent': Size(1.0, 0.15)}, 'flights at several states of charge',
         ('thrust_coefficient', 'mass'),
         'three flights at different charge; thrust steps by internal force'),
+    'formula': Treatment(
+        # in typical sizes of each term
+        {'coefficients': Size(1.0, 0.2)}, 'motion as in the flights that it was found in', (),
+        'motion in which its terms differ'),
     'rotor_lag': Treatment(
         {'time_constant': Size(0.4, 0.12, 'lag', step=0.02)}, 'thrust steps',
         ('rotor_dead_time', 'axial_inflow', 'command_latency'),

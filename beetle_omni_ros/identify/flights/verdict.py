@@ -46,7 +46,8 @@ BAG_GROUPS = {group: {'used': True, 'channels': [c for c in BagFlight.channels
 # Entries of each group of channels. Those of the torques also need the forces.
 FORCES = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_drag',
           'axial_inflow', 'translational_lift', 'wind', 'voltage_sag', 'rotor_lag',
-          'rotor_dead_time', 'command_latency', 'imu_accelerometer_bias', 'imu_misalignment')
+          'rotor_dead_time', 'command_latency', 'imu_accelerometer_bias', 'imu_misalignment',
+          'formula')
 TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coefficient',
            'rotor_hub_moment', 'propeller_gyroscopic_torque', 'rotor_acceleration_torque')
 EXPLAINED = 0.5         # share of the angular acceleration: below, errors exceed what is explained
@@ -56,7 +57,8 @@ WEIGHED = 'mass', 'inertia'
 LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
 # Entries of the comparison of IMU and MoCap.
 SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
-Then = Callable[[Engine, Solution, dict, Starts | None], dict]     # further results
+Then = Callable[[Engine, Solution, dict, Starts | None, list], dict]   # adds; last: judges
+
 
 def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: RobotParameters,
            p: GapParameters, alpha: float = ALPHA, then: Then | None = None) -> dict:
@@ -66,7 +68,8 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     every = [BagFlight(flight, robot, body, keys, p) for flight in [*flights, *judging]]
     models, others = every[:len(flights)], every[len(flights):]
     late = first_point(models, every, robot)
-    starts = _starts(keys, models)
+    starts = {name: own for name, own in _starts(keys, models).items()
+              if name.partition('@')[0] not in p.without}
     tangents = {f'{name}~{key}': (name, key) for name, start in starts.items() for key in start}
     for model in every:
         model.starts, model.tangents = starts, tangents
@@ -75,7 +78,7 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     tolerance = tolerances(p) | delays
     priors, entries, bounds, far = _priors(robot, {
         n: key for n, key in keys.items() if key.effect in CATALOGUE and not key.form
-        and key.effect not in LIMITS}, tolerance)
+        and key.effect not in {*LIMITS, *p.without}}, tolerance)
     priors |= {n: Prior(tolerance[n], key.typical, 0.0) for n, key in extra_keys().items()
                 if n != 'modules.share' or robot.multibody is not None}
     for start, own in starts.items():
@@ -94,7 +97,7 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
         model.settle(dict(zip(engine.names[:engine.real], solution.theta, strict=False)))
     result = concluded(engine, solution, keys, others or models, BAG_GROUPS, starts=starts,
                        held_out=bool(judging))
-    return result | then(engine, solution, result, starts) if then else result
+    return result | then(engine, solution, result, starts, others or models) if then else result
 
 
 def _priors(robot, keys, tolerance, stamps=0.0, weighed=WEIGHED):
@@ -176,7 +179,7 @@ def _engine(flights, robot, p, declared, alpha, progress):
         names -= {'voltage_sag'}
     if 'force_x' not in channels:
         names -= {'imu_misalignment', 'wind', 'rotor_drag', 'body_drag'}
-    keys = keys_of(robot, names)
+    keys = keys_of(robot, names - set(p.without))
     # Air is still in a hall.
     priors, entries, bounds, far = _priors(robot, keys, tolerances(p), declared.clock_deviation,
                                             (*WEIGHED, 'wind'))
@@ -248,7 +251,7 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
     result = concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
                        findings=findings, slow=Balance(slow, robot) if slow else None,
                        measured='specific_force' in declared.signals)
-    return result | then(engine, solution, result, None) if then else result
+    return result | then(engine, solution, result, None, judges) if then else result
 
 
 def _groups(flight, declared):

@@ -79,9 +79,13 @@ def log_orthant(mean: np.ndarray, covariance: np.ndarray) -> float:
     Expectation propagation, exact for independent variables (Cunningham, Hennig and
     Lacoste-Julien 2011).
     """
+    if len(mean) < 2:       # exact
+        return float(np.sum(log_ndtr(mean / np.sqrt(np.diag(covariance)))))
     precision, shift = np.zeros((2, len(mean)))     # of the Gaussian factors of the half spaces
     for _ in range(SWEEPS):
-        _, inner, centre = _with_factors(mean, covariance, precision, shift)
+        wide = np.eye(len(mean)) + covariance * precision
+        inner = np.linalg.solve(wide, covariance)
+        centre = mean + inner @ (shift - precision * mean)
         variance = 1 / (1 / np.diag(inner) - precision)
         own = variance * (centre / np.diag(inner) - shift)
         size = own / np.sqrt(variance)
@@ -89,19 +93,12 @@ def log_orthant(mean: np.ndarray, covariance: np.ndarray) -> float:
         left = variance * np.maximum(1 - ratio * (ratio + size), 1e-12)
         precision = (precision + 1 / left - 1 / variance) / 2       # half way, for convergence
         shift = (shift + (own + np.sqrt(variance) * ratio) / left - own / variance) / 2
-    total, *_ = _with_factors(mean, covariance, precision, shift)
+    wide, moved = np.eye(len(mean)) + covariance * precision, shift - precision * mean
+    total = (moved @ np.linalg.solve(wide, covariance) @ moved - np.linalg.slogdet(wide)[1]) / 2 \
+        + np.sum(shift * mean - precision * mean**2 / 2)
     wide = 1 + precision * variance
     return float(total + np.sum(log_ndtr(size) + np.log(wide) / 2 - (
         variance * shift**2 / 2 + own * shift - own**2 * precision / 2) / wide))
-
-
-def _with_factors(mean, covariance, precision, shift):
-    """Logarithm of the mass, covariance and mean of a Gaussian times Gaussian factors."""
-    wide = np.eye(len(mean)) + covariance * precision
-    inner, moved = np.linalg.solve(wide, covariance), shift - precision * mean
-    mass = (moved @ inner @ moved - np.linalg.slogdet(wide)[1]) / 2 + np.sum(
-        shift * mean - precision * mean**2 / 2)
-    return mass, inner, mean + inner @ moved
 
 
 def log_integral(h: np.ndarray, g: np.ndarray, rows: np.ndarray, room: np.ndarray) -> float:

@@ -81,6 +81,7 @@ class GapParameters:
     least_duration: float = _time('Least duration of a flight.', 4)
     longest_gap: float = _time('Longest silence of a sensor.', 0.01)
     most_lost: float = _share('Largest share of a flight in silences.')
+    without: schema.NAMES = parameter((), doc='Effects of body and rotors that are no candidates.')
 
     @classmethod
     def load(cls, path: str | Path | None = None, **changed) -> GapParameters:

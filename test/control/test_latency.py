@@ -1,0 +1,88 @@
+"""On-line estimate of additional delays."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import butter, lfilter
+
+from beetle_omni_ros.bags.metrics import metrics
+from beetle_omni_ros.control.latency import LatencyEstimator
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.flight.evaluate import fly
+from beetle_omni_ros.model.effects import validated
+from beetle_omni_ros.model.parameters import RobotParameters
+
+ROBOT = RobotParameters.load()
+STEP, FINE = 0.01, 10   # [s] of the estimator; samples of the signal within it
+NOISE = np.repeat([0.3, 3.0], 3)
+
+
+def estimate(delay, scale, seed, seconds=40.0, gain=1.0):
+    """
+    Estimate for a robot whose accelerations are ``delay`` later than those of the model.
+
+    The model has the estimated delay. The errors are those of the mean over each step, with noise
+    and a slow drift.
+    """
+    rng = np.random.default_rng(seed)
+    count = round(seconds / STEP) * FINE
+    # motion up to 2 Hz
+    signal = lfilter(*butter(2, 2.0, fs=FINE / STEP), rng.normal(size=(count, 6)), axis=0)
+    signal *= scale * NOISE / signal.std(0)
+    time = np.arange(count) * STEP / FINE
+
+    def mean(late):
+        late = np.array([np.interp(time - late, time, column) for column in signal.T]).T
+        return late.reshape(-1, FINE, 6).mean(1)
+
+    true = gain * mean(delay) + NOISE * (0.3 * rng.normal(size=(count // FINE, 6)) + np.sin(
+        0.3 * time[::FINE, None]))
+    known = {round(ms): mean(ms / 1e3) for ms in range(61)}
+    estimator = LatencyEstimator(0.05, 4.0, NOISE)
+    slow = np.zeros(6)
+    for k, row in enumerate(true):
+        predicted = known[round(estimator.latency * 1e3)][k]
+        error = row - predicted - slow
+        slow += 4.0 * STEP * error      # as the disturbance estimate does
+        estimator.observe(predicted, error, STEP)
+    return estimator.latency
+
+
+@pytest.mark.parametrize('delay', [0.0, 0.01, 0.025, 0.04])
+def test_the_delay_of_a_moving_robot_is_found(delay):
+    found = [estimate(delay, 3.0, seed) for seed in range(3)]
+    assert np.allclose(found, delay, atol=0.004)
+
+
+def test_a_wrong_thrust_is_no_delay():
+    assert max(estimate(0.0, 3.0, seed, gain=1.3) for seed in range(3)) < 0.005
+
+
+def test_without_motion_there_is_no_delay():
+    assert max(estimate(0.03, 0.02, seed) for seed in range(3)) < 0.005
+
+
+def test_one_outlier_does_not_move_the_estimate():
+    estimator = LatencyEstimator(0.05, 4.0, NOISE)
+    rng = np.random.default_rng(0)
+    for k in range(3000):
+        estimator.observe(NOISE * np.sin(6.0 * STEP * k), 0.1 * NOISE * rng.normal(size=6), STEP)
+    before = estimator.latency
+    estimator.observe(NOISE, 1000.0 * NOISE, STEP)
+    for k in range(50):
+        estimator.observe(NOISE * np.sin(6.0 * STEP * k), 0.1 * NOISE * rng.normal(size=6), STEP)
+    assert abs(estimator.latency - before) < 0.002
+
+
+@pytest.mark.parametrize('name, effects', [
+    ('nmpc', {'command_latency': {'delay': 0.03}}),
+    ('rl', {'command_latency': {'delay': 0.03}}),
+    ('rl', {'joint_feedback_delay': {'delay': 0.03}})])
+def test_a_robot_with_unknown_delays_is_flown_as_the_known_one(name, effects):
+    task, plant = make_task('random2', 5), replace(ROBOT, effects=validated(effects))
+    known, unknown = (metrics(fly(name, task, robot=ROBOT, plant=each, seed=5), task)
+                      for each in (ROBOT, plant))
+    assert all(pose['reached'] for pose in unknown['poses'])
+    assert unknown['mean']['U_orientation_deg'] < known['mean']['U_orientation_deg'] + 0.2
+    assert unknown['hover_command_change_rms']['joint_rad'] < 0.01
