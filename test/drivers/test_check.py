@@ -15,7 +15,7 @@ from servo_bench import running
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.bags.messages import Diagnostic
-from beetle_omni_ros.drivers import device_checks, motor_board
+from beetle_omni_ros.drivers import device_checks, mavlink
 from beetle_omni_ros.drivers.check import ObservedGraph, run_check
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
@@ -217,7 +217,7 @@ def test_each_fault_of_the_board_is_found_and_named(emulated, break_it, changes,
 
 def test_a_silent_or_foreign_board_ends_the_checks(emulated, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(motor_board, 'BOARD', (1, 7))
+        patch.setattr(mavlink, 'BOARD', (1, 7))
         found = board_with(emulated, {'motor board': 'fail'}, seconds=0.5)
     assert 'another device' in found['motor board'].remedy
     emulated.faults.drop_out = 1.0
