@@ -31,7 +31,7 @@ def test_five_lines_describe_a_flight(log):
     lines = repr(log).splitlines()
     assert len(lines) == 5 and max(map(len, lines[:4])) < 120
     assert lines[0].startswith('flight of hover: task own poses') and ' s from 20' in lines[1]
-    assert lines[2].startswith('poses reached 4 of 4; U 0.') and lines[3].startswith('alarms none')
+    assert lines[2].startswith('poses reached 5 of 5; U 0.') and lines[3].startswith('alarms none')
 
 
 def test_charts_are_chosen_by_the_begin_of_their_titles(log):
