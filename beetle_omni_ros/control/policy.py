@@ -30,8 +30,8 @@ class PolicyParameters(ParameterFile, file='rl.yaml'):
     matching: bool = parameter(
         True, doc='fly another robot than that of the training by model matching')
     latency: float = parameter(
-        DisturbanceParameters().latency, doc='largest additional delay of the commands that is '
-        'estimated and predicted; 0: none', unit='s', low=0, high=0.2)
+        DisturbanceParameters().latency, doc='largest additional delay of commands, and of joint '
+        'feedback, that is estimated and predicted; 0: none', unit='s', low=0, high=0.2)
     reach: float = parameter(6.5, doc='a target farther from the robot is refused', unit='m',
                              low=0.5, high=1000)
     without: str = parameter('', doc="layers of the guidance that are off: names with commas, or "
