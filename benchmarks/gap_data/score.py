@@ -83,8 +83,8 @@ def _reached(value, relation, target):
     if value is None or target is None:
         return None
     if relation == 'in':
-        return target[0] <= value <= target[1]
-    return value >= target if relation == '>=' else value <= target
+        return bool(target[0] <= value <= target[1])
+    return bool(value >= target if relation == '>=' else value <= target)
 
 
 def markdown(report: dict) -> str:
