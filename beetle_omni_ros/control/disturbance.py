@@ -3,7 +3,7 @@ Disturbance estimates for offset-free control.
 
 Three slow estimates integrate the prediction error of the model: an external force in world, an
 external torque in body and an offset of each servo's resting angle. An additional delay of the
-commands is estimated, too (:mod:`control.latency`). For a robot file with ``joint_friction`` the
+commands is estimated, too (:mod:`control.latency`), and noise is removed. For a robot file with ``joint_friction`` the
 targets overcome it. docs/explanation/nmpc.md has the reasons.
 """
 
@@ -22,7 +22,7 @@ from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.rotations import matrix
 from beetle_omni_ros.model.schema import parameter
 
-MOTION = np.r_[model.VELOCITY, model.RATE]  # of a state, which the filter removes noise from
+MOTION = np.r_[model.VELOCITY, model.RATE]  # of a state: what the filter removes noise from
 PERIOD = 0.01       # [s] between two states
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
 SHORT = 0.002           # [s] a command change nearer to an end of a span is treated as at this end
