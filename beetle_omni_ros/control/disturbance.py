@@ -3,8 +3,8 @@ Disturbance estimates for offset-free control.
 
 Three slow estimates integrate the prediction error of the model: an external force in world, an
 external torque in body and an offset of each servo's resting angle. An additional delay of the
-commands is estimated, too (:mod:`control.latency`), and noise is removed. For a robot file with ``joint_friction`` the
-targets overcome it. docs/explanation/nmpc.md has the reasons.
+commands is estimated, and noise is removed (:mod:`control.latency`). For a robot file with
+``joint_friction`` the targets overcome it. docs/explanation/nmpc.md has the reasons.
 """
 
 from collections import deque

@@ -1,5 +1,5 @@
 """
-On-line estimate of the additional delay with which commands act.
+On-line estimates of the additional delay with which commands act, and of what is noise.
 
 If commands act tau later than a model assumes, it predicts the acceleration a(t) where the robot
 has a(t - tau). To first order its error is e = -tau da/dt. Weighted least squares of e on -da/dt,
