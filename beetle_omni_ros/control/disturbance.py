@@ -3,8 +3,8 @@ Disturbance estimates for offset-free control.
 
 Three slow estimates integrate the prediction error of the model: an external force in world, an
 external torque in body and an offset of each servo's resting angle. An additional delay of the
-commands is estimated, too (:mod:`control.latency`). For a robot file with ``joint_friction`` the
-targets overcome it. docs/explanation/nmpc.md has the reasons.
+commands is estimated, and noise is removed (:mod:`control.latency`). For a robot file with
+``joint_friction`` the targets overcome it. docs/explanation/nmpc.md has the reasons.
 """
 
 from collections import deque
@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.control.latency import LatencyEstimator
+from beetle_omni_ros.control.latency import LatencyEstimator, NoiseFilter
 from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.model import native
 from beetle_omni_ros.model.allocation import ActuatorHealth, ALL_HEALTHY, clipped
@@ -22,6 +22,7 @@ from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.rotations import matrix
 from beetle_omni_ros.model.schema import parameter
 
+MOTION = np.r_[model.VELOCITY, model.RATE]  # of a state: what the filter removes noise from
 PERIOD = 0.01       # [s] between two states
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
 SHORT = 0.002           # [s] a command change nearer to an end of a span is treated as at this end
@@ -65,6 +66,8 @@ class DisturbanceEstimator:
         known_delay: from a command to the actuators [s], with the mean of the robot file's delays
             of tilts and thrusts, with which the NMPC's error on a lemniscate is smallest.
         disturbance: (10,) force in world [N], torque in body [N m], servo offsets [rad].
+        reading: (4,) tilts without the noise of the encoders, moved on by the estimated additional
+            delay of the joints [rad].
 
     """
 
@@ -82,6 +85,10 @@ class DisturbanceEstimator:
                                       MOTION_NOISE)
         self._late_tilts = LatencyEstimator(
             p.latency, p.tilt_bandwidth + TILT_CORRECTION / PERIOD, TILT_NOISE)
+        # Slower filters would let the disturbance estimates oscillate.
+        least = 4 * PERIOD * np.repeat([p.force_bandwidth, p.torque_bandwidth], 3)
+        self._motion_noise = NoiseFilter(np.where(least > 0, least, 1.0))
+        self._tilt_noise = NoiseFilter(np.zeros(4))
         self._estimates_latency = p.latency > 0
         # bandwidth times inertia: turns a velocity error of one step into a change of force
         self._force_gain = p.force_bandwidth * robot.mass
@@ -111,11 +118,12 @@ class DisturbanceEstimator:
 
     def reset(self):
         """Reset all estimates."""
-        self._late.reset()
-        self._late_tilts.reset()
+        for each in (self._late, self._late_tilts, self._motion_noise, self._tilt_noise):
+            each.reset()
         self._begin_block()
         self.disturbance = np.zeros(model.DISTURBANCE_SIZE)
         self._state: np.ndarray | None = None
+        self.reading = np.zeros(4)
         self._direction = np.zeros(4)
         self._stamp = -np.inf
         self._commands: deque[Command] = deque(maxlen=HISTORY)
@@ -147,16 +155,7 @@ class DisturbanceEstimator:
         seen = present = self.observe(state)
         if self.latency > SHORT:
             seen = self.flown(present, state.stamp, self.latency)
-        return flown(state, seen, self.reading(state) + seen[model.TILT] - present[model.TILT])
-
-    def reading(self, state: State) -> np.ndarray:
-        """Measured tilts (4,) [rad], moved on by the estimated additional delay of the joints."""
-        if self._late_tilts.latency < SHORT:
-            return state.tilt
-        stamp = state.tilt_stamp - self._known_encoder_delay
-        late, due = (self._modelled_tilt(each) for each in (
-            stamp - self._late_tilts.latency, stamp))
-        return state.tilt if late is None or due is None else state.tilt + due - late
+        return flown(state, seen, self.reading + seen[model.TILT] - present[model.TILT])
 
     def observe(self, state: State) -> np.ndarray:
         """Update with one state estimate; returns the (25,) full state at its stamp."""
@@ -169,6 +168,7 @@ class DisturbanceEstimator:
                 else self._sent
             self._commands.append(Command(state.command.stamp, rest, state.command.thrust))
         step = state.stamp - self._stamp
+        motion = np.concatenate([state.velocity, state.angular_velocity])
         if self._state is None or not 0 < step <= LONGEST_STEP:
             thrust = np.zeros(4) if state.command is None else state.command.thrust
             actuators = np.concatenate([state.tilt, state.tilt_velocity, thrust])
@@ -178,10 +178,12 @@ class DisturbanceEstimator:
             self._begin_block()
         else:
             predicted = self.flown(self._state, self._stamp, step)
-            self._learn(state, predicted)
+            error = self._motion_noise.without(motion - predicted[MOTION], step)
+            motion = predicted[MOTION] + error
+            self._learn(state, predicted, error)
             actuators = predicted[13:]
-        present = np.concatenate([state.position, state.velocity, state.quaternion,
-                                  state.angular_velocity, actuators])
+        present = np.concatenate([state.position, motion[:3], state.quaternion, motion[3:],
+                                  actuators])
         self._correct_tilt(state, present, step)
         self._state, self._stamp = present, state.stamp
         self._tilts.append((state.stamp, present[model.TILT].copy()))
@@ -224,15 +226,13 @@ class DisturbanceEstimator:
             return self._commands[0].tilt, self._commands[0].thrust
         return (np.zeros(4) if self._state is None else self._state[model.TILT]), np.zeros(4)
 
-    def _learn(self, state, predicted):
-        velocity = state.velocity - predicted[model.VELOCITY]
-        rate = state.angular_velocity - predicted[model.RATE]
+    def _learn(self, state, predicted, error):
         change = np.zeros(model.DISTURBANCE_SIZE)
-        change[model.FORCE] = self._force_gain * velocity
-        change[model.TORQUE] = self._torque_gain * rate
+        change[model.FORCE] = self._force_gain * error[:3]
+        change[model.TORQUE] = self._torque_gain * error[3:]
         self.disturbance = clipped(self.disturbance + change, -LIMIT, LIMIT)
         if self._estimates_latency:
-            self._errors += np.concatenate([velocity, rate])
+            self._errors += error
             self._changes += predicted - self._state
             self._span += state.stamp - self._stamp
             if self._span > BLOCK:
@@ -253,14 +253,20 @@ class DisturbanceEstimator:
 
     def _correct_tilt(self, state, present, step):
         """Compare the encoders with the tilt model at their capture time."""
-        modelled = self._modelled_tilt(state.tilt_stamp - self.encoder_delay)
+        stamp = state.tilt_stamp - self._known_encoder_delay
+        due, modelled = (self._modelled_tilt(each) for each in (
+            stamp, stamp - self._late_tilts.latency))
+        self.reading = state.tilt
         if modelled is None:
             return
+        error = state.tilt - modelled
+        clean = self._tilt_noise.without(error, step)
+        self.reading = due + clean
         limit = LIMIT[model.TILT_OFFSET]
-        error = self._movable * clipped(state.tilt - modelled, -limit, limit)
+        error = self._movable * clipped(error, -limit, limit)
         if self._estimates_latency:
             self._late_tilts.observe(modelled, error, step)
-        present[model.TILT] += TILT_CORRECTION * error
+        present[model.TILT] += TILT_CORRECTION * self._movable * clipped(clean, -limit, limit)
         change = self._tilt_bandwidth * step * error
         if self._sticks and self._commands:
             # Friction explains a reading within the band, the offset only what is beyond.

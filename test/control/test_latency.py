@@ -1,4 +1,4 @@
-"""On-line estimate of additional delays."""
+"""On-line estimate of additional delays, and what is noise."""
 
 from dataclasses import replace
 
@@ -7,11 +7,11 @@ import pytest
 from scipy.signal import butter, lfilter
 
 from beetle_omni_ros.bags.metrics import metrics
-from beetle_omni_ros.control.latency import LatencyEstimator
+from beetle_omni_ros.control.latency import LatencyEstimator, NoiseFilter
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.evaluate import fly
 from beetle_omni_ros.model.effects import validated
-from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import find_robot, RobotParameters
 
 ROBOT = RobotParameters.load()
 STEP, FINE = 0.01, 10   # [s] of the estimator; samples of the signal within it
@@ -86,3 +86,31 @@ def test_a_robot_with_unknown_delays_is_flown_as_the_known_one(name, effects):
     assert all(pose['reached'] for pose in unknown['poses'])
     assert unknown['mean']['U_orientation_deg'] < known['mean']['U_orientation_deg'] + 0.2
     assert unknown['hover_command_change_rms']['joint_rad'] < 0.01
+
+
+@pytest.mark.parametrize('least', [0.0, 0.2])
+def test_noise_is_removed_and_motion_stays(least):
+    rng = np.random.default_rng(0)
+    noise, time = rng.normal(size=(4000, 3)), STEP * np.arange(4000)[:, None]
+    motion = 10.0 * np.sin(2.0 * time + np.arange(3.0))
+    for added, expected in ((0.0, least * noise), (motion, motion + noise)):
+        noise_filter = NoiseFilter(np.full(3, least))
+        kept = np.array([noise_filter.without(each, STEP) for each in noise + added])
+        assert (kept - expected)[1000:].std() < 0.3
+
+
+def test_a_sudden_error_passes_but_for_the_size_of_the_noise():
+    noise_filter, rng = NoiseFilter(np.zeros(3)), np.random.default_rng(1)
+    for each in rng.normal(size=(2000, 3)):
+        noise_filter.without(each, STEP)
+    assert np.all(noise_filter.without(np.full(3, 50.0), STEP) > 30.0)
+
+
+@pytest.mark.parametrize('name', ['nmpc', 'rl'])
+def test_noise_of_the_sensors_does_not_reach_the_commands(name):
+    robot, task = RobotParameters.load(find_robot('measured')), make_task('random2', 5)
+    quiet, noisy = (metrics(fly(name, task, robot=robot, plant=robot, seed=5, conditions=each),
+                            task) for each in ('nominal', 'published'))
+    assert all(pose['reached'] for pose in quiet['poses'] + noisy['poses'])
+    # The noise of an encoder has 0.02 rad.
+    assert noisy['hover_command_change_rms']['joint_rad'] < 0.02
