@@ -38,7 +38,6 @@ from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 from beetle_omni_ros.supervisor.interface import Event, SupervisorParameters
 
-START_TIMEOUT = 5.0      # [s] for the estimator; noisy poses can need longer than ARMING_TIME
 TAKEOFF_TIMEOUT = 30.0   # [s] simulated time for the take-off
 ARMING_TIME = 0.5        # [s] on the ground before arming, for the start of the estimator
 SWAP_CHARGE = 0.3        # [-] charge below which the pack is replaced at the next target
@@ -218,6 +217,8 @@ class FlightLoop(Loop):
 
     """
 
+    start_timeout = 5.0     # [s] for the estimator; noisy poses can need longer than ARMING_TIME
+
     def __init__(self, robot: RobotParameters, plant: RobotParameters,
                  controllers: dict[str, Controller], recorder: Recorder, *,
                  conditions: str = 'nominal', seed: int = 0, faults: Sequence[Fault] = (),
@@ -302,7 +303,7 @@ class FlightLoop(Loop):
                 raise RunError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
                                f"'{supervisor.state}' ({'; '.join(events[2::-1])})")
             if not asked and now >= ARMING_TIME - ROUNDING and (
-                    not supervisor.why_not_arm() or now >= START_TIMEOUT):
+                    not supervisor.why_not_arm() or now >= self.start_timeout):
                 asked = True
                 answer = self.request('arm')
                 if not answer:
