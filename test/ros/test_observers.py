@@ -17,9 +17,9 @@ from beetle_omni_ros.drivers.check import check_topics
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.readings import ImuReading, JointReading, PoseReading
 from beetle_omni_ros.model.rotations import BodyState
-from beetle_omni_ros.ros import listeners, wire
+from beetle_omni_ros.ros import clients, wire
+from beetle_omni_ros.ros.clients import Client, listen, LiveGraph
 from beetle_omni_ros.ros.graph import claim, domains_in_use
-from beetle_omni_ros.ros.listeners import Client, listen, LiveGraph
 from beetle_omni_ros.ros.nodes import ViewerNode
 from beetle_omni_ros.show.recorded import Newest
 
@@ -86,12 +86,12 @@ def test_the_view_names_the_domains_with_a_flight_and_shows_the_only_one(
         assert f'in ROS domain {ros_domain}; ' in graph.waits()
         assert '--domain-id 230, --domain-id 231' in graph.waits()
     shown = []
-    monkeypatch.setattr(listeners, 'LiveGraph', lambda namespace, domain: shown.append(domain))
-    monkeypatch.setattr(listeners, 'domains_in_use', lambda: [230])
+    monkeypatch.setattr(clients, 'LiveGraph', lambda namespace, domain: shown.append(domain))
+    monkeypatch.setattr(clients, 'domains_in_use', lambda: [230])
     for environment in ('', '5'):
         monkeypatch.setenv('ROS_DOMAIN_ID', environment)
         with suppress(AttributeError):      # of the graph that is not made
-            listeners.run_live(host='127.0.0.1', port=8080)
+            clients.run_live(host='127.0.0.1', port=8080)
     assert shown == [230, None]
 
 
