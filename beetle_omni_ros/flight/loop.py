@@ -149,19 +149,17 @@ class Loop:
         self._now = simulator.epoch + simulator.time
         self.before_messages()
         self.deliver()
-        if simulator.time + ROUNDING >= self._next_due:
-            self._call_timers(simulator.time + ROUNDING)
+        now = simulator.time + ROUNDING
+        if now >= self._next_due:
+            for component, timer in self._timers:
+                if self._due[id(timer)] <= now:
+                    self._due[id(timer)] += timer.period
+                    if component not in self._waiting:
+                        timer.call()
+                        self.deliver()
+            self._next_due = min(self._due.values())
         self.robot.publish(frame)
         self.deliver()
-
-    def _call_timers(self, now):
-        for component, timer in self._timers:
-            if self._due[id(timer)] <= now:
-                self._due[id(timer)] += timer.period
-                if component not in self._waiting:
-                    timer.call()
-                    self.deliver()
-        self._next_due = min(self._due.values())
 
     def before_messages(self) -> None:
         """Hook after the robot's tick; overridden by subclasses."""
