@@ -220,10 +220,10 @@ class Operator(Client):
         future = client.call_async(request)
         return future.result() if self.wait(future.done, timeout) else None
 
-    def set(self, node: str, name: str, value, timeout: float = 5.0) -> tuple[bool, str]:
+    def set(self, node: str, name: str, value) -> tuple[bool, str]:
         """Set a parameter of a node; return (accepted, answer)."""
         answer = self.request(f'{node}/set_parameters', SetParameters,
-                              wire.parameter_request(name, value), timeout)
+                              wire.parameter_request(name, value), 5.0)
         if answer is None:
             return False, f'{node} does not answer'
         return answer.results[0].successful, answer.results[0].reason

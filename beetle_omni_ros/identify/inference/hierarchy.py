@@ -23,6 +23,7 @@ TOLERANCE = 1e-6    # [nat] of the minimum of a negative log density, where it i
 KINK = 1e-3         # [nat] of a step that does not lower it, where it is not
 NEAR = 0.1          # [nat] of the minimum of a converged fit
 LONGEST = 2.0       # largest change of a coordinate in one iteration
+ITERATIONS = 40         # most of a minimisation
 FAR = 6.0           # standard deviations from which a bound has no effect
 SWEEPS = 20         # of expectation propagation
 # cost, gradient (X,) and positive definite information (X, X) at coordinates (X,)
@@ -229,8 +230,8 @@ def bounded_step(h: np.ndarray, g: np.ndarray, rows: np.ndarray, room: np.ndarra
     return step
 
 
-def levenberg_marquardt(local: Local, x: np.ndarray, rows: np.ndarray, limits: np.ndarray,
-                        iterations: int = 40) -> tuple[np.ndarray, bool]:
+def levenberg_marquardt(local: Local, x: np.ndarray, rows: np.ndarray, limits: np.ndarray
+                        ) -> tuple[np.ndarray, bool]:
     """
     Minimise a negative log density [nat] from ``x`` (X,), with ``rows x + limits >= 0``.
 
@@ -241,7 +242,7 @@ def levenberg_marquardt(local: Local, x: np.ndarray, rows: np.ndarray, limits: n
     x = x + bounded_step(np.eye(len(x)), np.zeros(len(x)), rows, rows @ x + limits)
     cost, g, h = local(x)
     damping = 1e-4
-    for _ in range(iterations):
+    for _ in range(ITERATIONS):
         room = rows @ x + limits
         left = _promised(h, g, bounded_step(h, g, rows, room))
         if left < TOLERANCE:
