@@ -37,7 +37,7 @@ NODES = {'sim_node': 'sim_node:SimNode', 'ekf_node': 'nodes:ekf_node',
          'joint_bridge_node': 'bridge_nodes:joint_bridge_node',
          'rotor_bridge_node': 'bridge_nodes:rotor_bridge_node',
          'reference_node': 'nodes:reference_node', 'recorder_node': 'nodes:RecorderNode',
-         'viewer_node': 'nodes:ViewerNode'}
+         'viewer_node': 'nodes:viewer_node'}
 # Parameter autostart of a bridge -> lifecycle state to reach.
 AUTOSTART = {'none': '', 'configure': 'inactive', 'activate': 'active'}
 COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes

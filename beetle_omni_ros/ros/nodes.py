@@ -148,19 +148,14 @@ class RecorderNode(FlightNode):
         self._bag = None
 
 
-class ViewerNode(FlightNode):
-    """Publishes description and frames of the robot for RViz and Foxglove, like those of a bag."""
-
-    def __init__(self):
-        super().__init__('viewer_node')
-        self._outputs = {     # tf2_msgs is not on PyPI
-            name: self.create_publisher(wire.message_class(kind), name, wire.profile(qos))
-            for name, (kind, qos) in FRAMES.items()}
-        frames = FrameWriter(self._write, '')
-        for topic in ('odom', 'joint_states'):
-            wire.subscribe_raw(self, topic, lambda data, topic=topic: frames.take(
-                topic, data, self.now()), SENSOR)
-        self.run(Component('viewer_node'))
-
-    def _write(self, topic, kind, data, t):
-        self._outputs[topic].publish(bytes(data))
+def viewer_node() -> FlightNode:
+    """Make that of description and frames for RViz and Foxglove, like those of a bag."""
+    node = FlightNode('viewer_node')
+    outputs = {     # tf2_msgs is not on PyPI
+        name: node.create_publisher(wire.message_class(kind), name, wire.profile(qos))
+        for name, (kind, qos) in FRAMES.items()}
+    frames = FrameWriter(lambda topic, kind, data, t: outputs[topic].publish(bytes(data)), '')
+    for topic in ('odom', 'joint_states'):
+        wire.subscribe_raw(node, topic, lambda data, topic=topic: frames.take(
+            topic, data, node.now()), SENSOR)
+    return node.run(Component('viewer_node'))

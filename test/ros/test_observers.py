@@ -20,7 +20,7 @@ from beetle_omni_ros.model.rotations import BodyState
 from beetle_omni_ros.ros import clients, wire
 from beetle_omni_ros.ros.clients import Client, listen, LiveGraph
 from beetle_omni_ros.ros.graph import claim, domains_in_use
-from beetle_omni_ros.ros.nodes import ViewerNode
+from beetle_omni_ros.ros.nodes import viewer_node
 from beetle_omni_ros.show.recorded import Newest
 
 pytestmark = pytest.mark.real_time
@@ -122,7 +122,7 @@ def test_messages_become_a_moment(make_bench, ros_domain):
 def test_the_viewer_node_publishes_description_and_frames(bench, monkeypatch):
     monkeypatch.setattr(wire, 'message_class', lambda name, real=wire.message_class: (
         String if name.startswith('tf2') else real(name)))      # tf2_msgs is not on PyPI
-    bench.add(ViewerNode())
+    bench.add(viewer_node())
     received, odom, joints = {}, *(wire.Publisher(bench.user, name)
                                    for name in ('odom', 'joint_states'))
     for name, (kind, qos) in FRAMES.items():
