@@ -235,7 +235,7 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
     page = {'host': host, 'port': port}
     graph = {'namespace': namespace, 'domain_id': domain_id}
     if not runs:
-        from beetle_omni_ros.ros.listeners import run_live
+        from beetle_omni_ros.ros.clients import run_live
         run_live(**graph, **page)
         return
     for name, value in graph.items():
@@ -314,7 +314,7 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
     Example: beetle_omni check --servo-port /dev/ttyUSB0 --skip board
     """
     def listen(duration):
-        from beetle_omni_ros.ros.listeners import listen as listen_to_ros
+        from beetle_omni_ros.ros.clients import listen as listen_to_ros
         return listen_to_ros(duration, namespace)
 
     from beetle_omni_ros.drivers.check import run_check

@@ -87,7 +87,7 @@ def improve(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
                         console, alpha=alpha)
     results: dict = {'verdict': found['verdict'], 'controllers': {}}
     if found['effects']:
-        from beetle_omni_ros.flight import improve as flown
+        from beetle_omni_ros.flight import experiment as flown
         results['controllers'] = flown.before_and_after(
             robot, corrected, plant, controllers, task, range(seed, seed + flights),
             output / 'flights', jobs, console)

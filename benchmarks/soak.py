@@ -30,6 +30,7 @@ import yaml
 from beetle_omni_ros.control.targets import COLUMNS
 from beetle_omni_ros.control.tasks import POSE_DURATION, WAYPOINTS
 from beetle_omni_ros.model.resources import share_path
+from beetle_omni_ros.ros.clients import Operator
 from beetle_omni_ros.ros.graph import (
     bridge_parameters,
     BRIDGES,
@@ -37,7 +38,6 @@ from beetle_omni_ros.ros.graph import (
     Graph,
     reserved_domain,
 )
-from beetle_omni_ros.ros.operator import Operator
 
 PERIOD = 10.0           # s between two samples
 WARM_UP = 0.2           # share of the flight before the fit, at least:

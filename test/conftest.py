@@ -36,8 +36,7 @@ STALL = 0.05        # s; the limits of silence in these tests are 50 to 80 ms
 MARKS = {'alone': re.compile(r'\bmark\.alone\b'),      # part of the suite -> in a file of it
          'real_time': re.compile(r'\bmark\.(real_time|alone)\b')}
 # Files of tests that wait for other processes, with timeouts; all others only compute.
-PROCESSES = re.compile(r'/(ros|tutorials|show)/test_\w+\.py$'
-                       r'|/test_(start|workers)\.py$')
+PROCESSES = re.compile(r'/(ros|tutorials|show)/test_\w+\.py$|/test_start\.py$')
 LANES = 'processes', 'computing'
 # Rooms with the longest tests, which begin first: at the end they would leave other workers idle.
 LONGEST = 'tutorials', 'gap_data', 'gap', 'flights', 'identify', 'flight'

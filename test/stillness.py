@@ -6,6 +6,7 @@ prints begin and end of late wake-ups until its parent process ends.
 """
 
 import os
+import re
 import sys
 import time
 
@@ -26,9 +27,10 @@ def watch():
 def stalls(watched, start, end):
     """Durations [s] of the stalls between two times of the monotonic clock."""
     time.sleep(2 * PERIOD)      # a stall that ends now is recorded soon
-    with open(watched[0].name) as lines:
-        times = [tuple(map(float, line.split())) for line in lines]
-    return [ended - began - PERIOD for began, ended in times if began < end and ended > start]
+    with open(watched[0].name) as file:     # lines that were written at once are mixed
+        times = re.findall(r'^(\d+\.\d+) (\d+\.\d+)$', file.read(), re.MULTILINE)
+    return [float(ended) - float(began) - PERIOD for began, ended in times
+            if float(began) < end and float(ended) > start]
 
 
 if __name__ == '__main__':

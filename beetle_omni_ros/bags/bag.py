@@ -59,7 +59,9 @@ def bag_files(path: str | Path) -> list[Path]:
         if path.suffix != '.mcap':
             raise ParameterError(f'{path}: expected a rosbag2 folder or a .mcap file')
         return [path]
-    files = sorted(path.glob('*.mcap'), key=_split_number)
+    # of a split bag name_2.mcap before name_10.mcap
+    files = sorted(path.glob('*.mcap'), key=lambda file: (
+        int(number) if (number := file.stem.rpartition('_')[2]).isdigit() else -1, file.name))
     if not files:
         other = sorted(p.name for pattern in ('*.db3', '*.mcap.*', '*.bag')
                        for p in path.glob(pattern))
@@ -79,12 +81,6 @@ def runs_in(paths: Iterable[str | Path]) -> list[Path]:
             inside = sorted({file.parent for file in path.glob('*/*.mcap')})
         runs += inside or [path]
     return runs
-
-
-def _split_number(file):
-    """Sort key of a split bag: name_2.mcap comes before name_10.mcap."""
-    number = file.stem.rpartition('_')[2]
-    return (int(number) if number.isdigit() else -1, file.name)
 
 
 def names_of(runs: list[Path]) -> list[str]:

@@ -13,7 +13,7 @@ from functools import partial
 import json
 from math import floor, isfinite
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -37,20 +37,16 @@ JOINT_STATE = 'sensor_msgs/msg/JointState'
 TRAJECTORY_TYPE = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 
 
-class Form(NamedTuple):
-    """One kind of message."""
-
-    type: str       # ROS message type
-    value: type     # class of its values
-    read: Callable[[Any], Any]      # message -> value; MessageError for another layout
-    write: Callable[[Any], Any]     # value -> message
-    take: Callable[[Any], Any]      # message -> value in flight; MessageError for an unusable one
+# One kind of message: ROS message type; class of its values; message -> value, with a
+# MessageError for another layout; value -> message; message -> value in flight, with a
+# MessageError for an unusable one too
+Form = tuple[str, type, Callable[[Any], Any], Callable[[Any], Any], Callable[[Any], Any]]
 
 
 def form(name: str, value: type, read: Callable[[Any], Any], write: Callable[[Any], Any],
          finite: Sequence[str] = ()) -> Form:
     """Return a form whose ``finite`` attributes are checked in flight; a quaternion is unit."""
-    return Form(name, value, read, write, partial(_checked, read, finite))
+    return name, value, read, write, partial(_checked, read, finite)
 
 
 def _checked(read, names, message):
@@ -213,7 +209,7 @@ def _as_target(target, message):
 
 POSE = vectors('geometry_msgs/msg/PoseStamped', readings.PoseReading, WORLD,
                position='pose.position xyz', quaternion='pose.orientation xyzw')
-POSE_TARGET = vectors(POSE.type, PoseTarget, WORLD, after_read=_as_target,
+POSE_TARGET = vectors(POSE[0], PoseTarget, WORLD, after_read=_as_target,
                       position='pose.position xyz', quaternion='pose.orientation xyzw')
 IMU = vectors('sensor_msgs/msg/Imu', readings.ImuReading, BODY, after_write=_fill_imu,
               specific_force='linear_acceleration xyz', angular_velocity='angular_velocity xyz')
@@ -273,7 +269,7 @@ def _take_joints(message):
     return readings.JointReading(seconds(message.header.stamp), position, velocity)
 
 
-JOINT = Form(JOINT_STATE, readings.JointReading, _read_joints, lambda value: _joint_state(
+JOINT: Form = (JOINT_STATE, readings.JointReading, _read_joints, lambda value: _joint_state(
     value.stamp, value.names, position=value.position, velocity=value.velocity,
     effort=value.effort), _take_joints)
 ROTOR = form(JOINT_STATE, readings.RotorReading, lambda message: readings.RotorReading(

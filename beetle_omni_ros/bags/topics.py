@@ -41,7 +41,7 @@ class Topic:
     name: str = field(compare=False)    # relative; command topics are equal otherwise
     qos: Qos            # quality of service that its publisher offers
     meaning: str        # description for the reference page
-    type: str           # this and the next four: as of :class:`.conversions.Form`
+    type: str           # this and the next four: as of :data:`.conversions.Form`
     value: type
     read: Callable[[Any], Any]
     write: Callable[[Any], Any]

@@ -95,7 +95,7 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters,
 def _check_bus(findings, link, parameters, joints):
     servos = xc330.make_servos(parameters)
     examined = [(servo, xc330.examine(link, servo)) for servo in servos]
-    present = [servo for servo, found in examined if found.model is not None]
+    present = [servo for servo, (model, *_) in examined if model is not None]
     for servo in present:
         try:
             servo.torque = bool(link.read(servo.identifier, xc330.TORQUE_ENABLE, xc330.ATTEMPTS))

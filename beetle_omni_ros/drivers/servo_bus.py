@@ -73,13 +73,12 @@ class ServoBus:
         self.disable()
         problems = []
         for servo in self.servos:
-            found = xc330.examine(self.link, servo)
-            if found.problem:
-                problems.append(f'{servo.name} (id {servo.identifier}): {found.problem}; '
-                                f'{found.remedy}')
+            _, firmware, problem, remedy = xc330.examine(self.link, servo)
+            if problem:
+                problems.append(f'{servo.name} (id {servo.identifier}): {problem}; {remedy}')
                 continue
             try:
-                xc330.configure(self.link, servo, self.parameters, found.firmware)
+                xc330.configure(self.link, servo, self.parameters, firmware)
             except ServoBusError as error:
                 problems.append(f'{servo.name}: {error}')
         if problems:

@@ -206,17 +206,12 @@ def reading(servos: Sequence[ServoState], stamp: float) -> JointReading:
                         [servo.name for servo in servos])
 
 
-class Examination(NamedTuple):
-    """What a servo answers: model and firmware, None without an answer; problem or '', remedy."""
+def examine(link, servo: ServoState) -> tuple[int | None, int | None, str, str]:
+    """
+    Read its state into ``servo`` through a :class:`ServoLink` and change nothing.
 
-    model: int | None
-    firmware: int | None
-    problem: str = ''
-    remedy: str = ''
-
-
-def examine(link, servo: ServoState) -> Examination:
-    """Read its state into ``servo`` through a :class:`ServoLink` and change nothing."""
+    Returned are model and firmware, None without an answer; problem or '', and remedy.
+    """
     model = None
     try:
         model = link.ping(servo.identifier, ATTEMPTS)
@@ -225,19 +220,16 @@ def examine(link, servo: ServoState) -> Examination:
                 INPUT_VOLTAGE, TEMPERATURE, HARDWARE_ERROR, PRESENT_POSITION, FIRMWARE))
     except ServoBusError as error:
         if model is not None:
-            return Examination(model, None, str(error),
-                               'check its cable, and whether two servos have this id')
-        return Examination(None, None, 'does not answer', 'check power, cable, id and baud rate') \
-            if link.late else Examination(None, None, str(error), 'reboot it')
+            return model, None, str(error), 'check its cable, and whether two servos have this id'
+        return (None, None, 'does not answer', 'check power, cable, id and baud rate') \
+            if link.late else (None, None, str(error), 'reboot it')
     servo.temperature, servo.voltage = float(temperature), voltage * VOLTAGE_UNIT
     servo.position = servo.angle(position) + TURN * servo.turns
     if model != MODEL:
-        return Examination(model, firmware, f'model {model}, expected {MODEL} (XC330-T181-T)',
-                           'another servo has this id, or ids is wrong')
-    if servo.error:
-        return Examination(model, firmware, ', '.join(servo.errors),
-                           'remove the cause, then reboot the servo')
-    return Examination(model, firmware)
+        return (model, firmware, f'model {model}, expected {MODEL} (XC330-T181-T)',
+                'another servo has this id, or ids is wrong')
+    return (model, firmware, ', '.join(servo.errors),
+            'remove the cause, then reboot the servo' if servo.error else '')
 
 
 # --- turns --------------------------------------------------------------------------------------

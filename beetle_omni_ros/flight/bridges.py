@@ -1,8 +1,10 @@
-"""The bridges between the topics and the actuators as components: servos and motor board."""
+"""Bridges from topics to servos and motor board as components; the loop that flies with them."""
 
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 import math
+import sys
 import time
 
 import numpy as np
@@ -13,9 +15,13 @@ from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_loop import ServoLoop
 from beetle_omni_ros.drivers.servo_xc330 import ServoBusError
 from beetle_omni_ros.flight.component import Component, Distribution, ERROR, OK, WARN
+from beetle_omni_ros.flight.loop import FlightLoop
 from beetle_omni_ros.model.mode import COMMAND_AGE
 from beetle_omni_ros.model.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.model.readings import RotorReading
+from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.sim.emulated.device import EmulatedActuators
+from beetle_omni_ros.sim.faults import DEVICES
 from beetle_omni_ros.supervisor.interface import Answer, INFO, WARNING
 from beetle_omni_ros.supervisor.interface import ERROR as SEVERE
 
@@ -262,7 +268,13 @@ class RotorBridge(Bridge):
             self._send_thrusts()
         self._cycle += 1
         if self._cycle % POLL_CYCLES == 0:
-            self._poll()
+            battery, rotors = self._board.poll()
+            if battery is not None:
+                self._battery = battery
+                self.send('battery_state', battery)
+            if rotors is not None:
+                self._speeds = rotors
+                self.send('rotor_states', RotorReading(rotors.stamp, RPM * rotors.rpm))
         self.changed()
 
     def _send_thrusts(self):
@@ -278,15 +290,6 @@ class RotorBridge(Bridge):
             return False
         self._saturated += self._board.saturated
         return True
-
-    def _poll(self):
-        battery, rotors = self._board.poll()
-        if battery is not None:
-            self._battery = battery
-            self.send('battery_state', battery)
-        if rotors is not None:
-            self._speeds = rotors
-            self.send('rotor_states', RotorReading(rotors.stamp, RPM * rotors.rpm))
 
     def state_text(self) -> str:
         """Return the state of the board, or why its port is closed."""
@@ -328,3 +331,69 @@ class RotorBridge(Bridge):
         if saturates:
             return WARN, 'target above the thrust that the battery permits', values
         return OK, 'ok', values
+
+
+# --- the loop in real time ----------------------------------------------------------------------
+
+WAIT = 0.0005           # [s] between looks for messages of the drivers' threads
+THREAD_SWITCH = 0.0005  # [s] a servo has 3 ms to answer
+
+
+class EmulatedLoop(FlightLoop):
+    """
+    A flight whose commands go through bridges, drivers, serial ports and emulated devices.
+
+    The devices keep real time, and so does this loop; its digits depend on the computer. Close it
+    after the flight. Arguments are those of FlightLoop.
+    """
+
+    simulated = False
+    start_timeout = 20.0    # [s] also for the bridges
+
+    def __init__(self, robot, plant, *arguments, **options):
+        for fault in options.get('faults', ()):
+            if fault.changes(*DEVICES):
+                raise ParameterError(f"--faults: '{fault.kind}' affects a device; expected "
+                                     '--actuators direct')
+        servos, board = ServoBusParameters.load(), MotorBoardParameters.load()
+        self._began = time.monotonic()
+        self._switch_interval = sys.getswitchinterval()
+        super().__init__(robot, plant, *arguments, **options)
+        devices = EmulatedActuators.of(self.simulator, plant, servos, seed=options.get('seed', 0))
+        self.robot.use(devices)
+        self._bridges: list[Bridge] = [
+            JointBridge(replace(servos, port=devices.bus.port), robot),
+            RotorBridge(replace(board, port=devices.board.port), robot)]
+        sys.setswitchinterval(THREAD_SWITCH)
+        for bridge in self._bridges:
+            self.add(bridge)
+            bridge.configure()
+            bridge.activate()
+            bridge.stage = ACTIVE
+            bridge.changed()
+        self._began = time.monotonic() - self.simulator.time
+
+    def now(self) -> float:
+        """Time on the clock of the stamps [s]."""
+        return self.simulator.epoch + self.elapsed()
+
+    def elapsed(self) -> float:
+        """Real time since the start [s]."""
+        return time.monotonic() - self._began
+
+    def step(self) -> None:
+        """Wait for the next tick, deliver the messages of the drivers meanwhile, and run it."""
+        due = self._began + self.simulator.time + self.simulator.tick
+        while (left := due - time.monotonic()) > 0:
+            time.sleep(min(left, WAIT))
+            self._now = self.now()
+            self.deliver()
+        super().step()
+
+    def close(self) -> None:
+        """Switch the devices off and end the recording."""
+        for bridge in self._bridges:
+            bridge.close()
+        self.robot.close()
+        sys.setswitchinterval(self._switch_interval)
+        super().close()

@@ -207,7 +207,7 @@ def _fly_all(function, calls, jobs) -> Iterator[tuple[int, dict]]:
         with workers(jobs):
             for k, result in joblib.Parallel(return_as='generator_unordered', batch_size=1,
                                              pre_dispatch='all')(
-                    joblib.delayed(_fly_one)(k, function, call)
+                    joblib.delayed(lambda k, call: (k, function(*call)))(k, call)
                     for k, call in enumerate(calls)):
                 finished += 1
                 yield k, result
@@ -218,10 +218,6 @@ def _fly_all(function, calls, jobs) -> Iterator[tuple[int, dict]]:
             f'a worker was lost, possibly for lack of memory; {finished} of {len(calls)} '
             'flights are kept and the same command continues; --jobs 1 needs the least '
             'memory') from None
-
-
-def _fly_one(k, function, call):
-    return k, function(*call)
 
 
 def workers(jobs: int | None = None):

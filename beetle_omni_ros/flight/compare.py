@@ -286,9 +286,9 @@ def write(results: dict, flown: dict, output: Path, console: Console) -> None:
     controllers = results['meta']['controllers']
     sections = page.sections(results, {flight: flown[flight] for flight in sorted(
         flown, key=lambda flight: (controllers.index(flight.controller), flight))})
-    for block in (block for section in sections for block in section.blocks):
-        if isinstance(block, page.Picture):
-            (output / f'{block.name}.png').write_bytes(block.data)
+    for block in (block for section in sections for block in section['blocks']):
+        if isinstance(block, dict):
+            (output / f"{block['name']}.png").write_bytes(block['data'])
     content = page.content(results, sections)
     for name in (PAGE, TEXT):
         write_text(output / name, rendered(f'comparison{Path(name).suffix}', **content), 'page')

@@ -1,7 +1,6 @@
 """The comparison as one self-contained HTML page, and as Markdown with pictures."""
 
 from base64 import b64encode
-from dataclasses import dataclass
 from io import BytesIO
 
 import matplotlib
@@ -148,29 +147,6 @@ NOTES = {**TEXTS['notes'], **{
     for name, (kind, direction, _, *times) in RISING.items()}}
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A drawing as PNG, with its file name and caption."""
-
-    name: str
-    caption: str
-    data: bytes
-
-    @property
-    def source(self) -> str:
-        """The data as a source of an <img>."""
-        return f'data:image/png;base64,{b64encode(self.data).decode()}'
-
-
-@dataclass(frozen=True)
-class Section:
-    """A heading, a paragraph, and pictures and tables in their order."""
-
-    title: str
-    text: str
-    blocks: list[Grid | Picture]
-
-
 def interval(entry: dict, digits: int) -> str:
     """Text of a mean and its interval."""
     text = number(entry['mean'], digits)
@@ -256,7 +232,7 @@ def glance(results: dict) -> Grid:
         faint_columns=frozenset(range(len(ours) + 1, len(ours) + len(summary.PUBLISHED) + 1)))
 
 
-def sections(results: dict, flown: dict) -> list[Section]:
+def sections(results: dict, flown: dict) -> list[dict]:
     """
     Pictures and tables of all flights.
 
@@ -264,21 +240,27 @@ def sections(results: dict, flown: dict) -> list[Section]:
         results: content of the JSON file.
         flown: flights and their results with traces.
 
+    Returns:
+        Sections with ``title``, ``text`` and ``blocks``, tables and pictures in their order. A
+        picture is the ``data`` of a PNG, its ``name`` and ``caption``, and ``source`` of an <img>.
+
     """
-    made = [Section('At a glance', '', [glance(results)])]
+    made = [{'title': 'At a glance', 'text': '', 'blocks': [glance(results)]}]
     with matplotlib.rc_context(figures.STYLE):
         for task, by_conditions in results['summary']['tasks'].items():
-            blocks: list[Grid | Picture] = []
+            blocks: list[Grid | dict] = []
             for conditions in by_conditions:
                 blocks.append(table(results, task, conditions))
                 groups = results_with_trace(flown, task, conditions)
                 for name, caption, draw in DRAWN.get(summary.kind_of(task), ()):
                     if groups and (figure := draw(groups, task)):
-                        blocks.append(Picture(f'{summary.kind_of(task)}_{name}_{conditions}',
-                                              f'{caption} ({conditions} conditions)',
-                                              png(figure)))
-            made.append(Section(summary.task_title(task),
-                                TEXTS['texts'].get(summary.kind_of(task), ''), blocks))
+                        data = png(figure)
+                        blocks.append({
+                            'name': f'{summary.kind_of(task)}_{name}_{conditions}', 'data': data,
+                            'caption': f'{caption} ({conditions} conditions)',
+                            'source': f'data:image/png;base64,{b64encode(data).decode()}'})
+            made.append({'title': summary.task_title(task), 'blocks': blocks,
+                         'text': TEXTS['texts'].get(summary.kind_of(task), '')})
     return made
 
 
@@ -291,7 +273,7 @@ def png(figure: Figure) -> bytes:
     return small.getvalue()
 
 
-def content(results: dict, made: list[Section]) -> dict:
+def content(results: dict, made: list[dict]) -> dict:
     """What the pages show: sections, brief tables by title, terms, facts, flights."""
     meta = results['meta']
     terms = []

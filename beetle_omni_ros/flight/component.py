@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 import math
 import time
 from typing import Any, Protocol
@@ -166,7 +167,7 @@ class Component:
         """Declare a topic of stamped values, see :class:`Input`."""
         self.inputs[topic] = Input(handle, expected, max_age, qos=qos)
         if topic == 'command':
-            self.follows(IDENTITY, self._on_identity)
+            self.follows(IDENTITY, partial(setattr, self, '_identity'))
 
     def follows(self, topic: str, handle: Callable[[Any], Any]) -> None:
         """Declare a latched topic without stamps: a state, a text."""
@@ -250,13 +251,8 @@ class Component:
         self.send(topic, value)
         return True
 
-    def _on_identity(self, identity):
-        self._identity = identity
-
     def _check_source(self, source):
-        """Refuse commands of a second publisher."""
-        # Until a supervisor publishes its identity, every command is accepted; after that, only
-        # those with the newest identity.
+        """Refuse commands of a second publisher, once a supervisor has published its identity."""
         identity = self._identity
         if identity and source != identity:
             name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'

@@ -54,7 +54,7 @@ def prepared(controller: str, *, robot: RobotParameters, plant: RobotParameters,
     memory = LogRecorder(meta)
     kind: type[FlightLoop] = FlightLoop
     if actuators == 'emulated':
-        from beetle_omni_ros.flight.real_time import EmulatedLoop  # has serial ports
+        from beetle_omni_ros.flight.bridges import EmulatedLoop  # has serial ports
         kind = EmulatedLoop
     with ExitStack() as stack:
         others = made(components, robot)    # before the bag, which a mistake would leave behind

@@ -116,7 +116,14 @@ def fly_case(flight: FaultFlight, case: Case, bags: Path | None = None,
     result = {**asdict(flight), 'good': False, 'bag': flight.name if bags else '', 'error': '',
               'flown_s': 0.0}
     try:
-        with collector_off(), closing(_loop(flight, case, bags)) as loop:
+        nominal, conditions = RobotParameters.load(), flight.conditions
+        true = RobotParameters.load(flight.plant) if flight.plant else nominal
+        if conditions == 'effects':
+            true, conditions = replace(true, effects=true.effects | EFFECTS), 'nominal'
+        with collector_off(), closing(prepared(
+                flight.controller, robot=nominal, plant=true, conditions=conditions,
+                seed=flight.seed, pilot=True, faults=case.strike, meta=asdict(flight),
+                bag=bags / flight.name if bags else None)) as loop:
             loop.take_off()
             # With other moves for each fault, a seed is not one move.
             moves = np.random.default_rng(
@@ -127,18 +134,6 @@ def fly_case(flight: FaultFlight, case: Case, bags: Path | None = None,
         text = f'{type(error).__name__}: {error}'[:200]
         result.update(outcome='error', error=text, failure=text)
     return result
-
-
-def _loop(flight, case, bags):
-    """Return the robot and its flight stack on the ground."""
-    nominal = RobotParameters.load()
-    true = RobotParameters.load(flight.plant) if flight.plant else nominal
-    conditions = flight.conditions
-    if conditions == 'effects':
-        true, conditions = replace(true, effects=true.effects | EFFECTS), 'nominal'
-    return prepared(flight.controller, robot=nominal, plant=true, conditions=conditions,
-                    seed=flight.seed, pilot=True, faults=case.strike, meta=asdict(flight),
-                    bag=bags / flight.name if bags else None)
 
 
 def _fly_struck(loop, moves, flight, case, plan):

@@ -38,7 +38,6 @@ from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 from beetle_omni_ros.supervisor.interface import Event, SupervisorParameters
 
-START_TIMEOUT = 5.0      # [s] for the estimator; noisy poses can need longer than ARMING_TIME
 TAKEOFF_TIMEOUT = 30.0   # [s] simulated time for the take-off
 ARMING_TIME = 0.5        # [s] on the ground before arming, for the start of the estimator
 SWAP_CHARGE = 0.3        # [-] charge below which the pack is replaced at the next target
@@ -150,19 +149,17 @@ class Loop:
         self._now = simulator.epoch + simulator.time
         self.before_messages()
         self.deliver()
-        if simulator.time + ROUNDING >= self._next_due:
-            self._call_timers(simulator.time + ROUNDING)
+        now = simulator.time + ROUNDING
+        if now >= self._next_due:
+            for component, timer in self._timers:
+                if self._due[id(timer)] <= now:
+                    self._due[id(timer)] += timer.period
+                    if component not in self._waiting:
+                        timer.call()
+                        self.deliver()
+            self._next_due = min(self._due.values())
         self.robot.publish(frame)
         self.deliver()
-
-    def _call_timers(self, now):
-        for component, timer in self._timers:
-            if self._due[id(timer)] <= now:
-                self._due[id(timer)] += timer.period
-                if component not in self._waiting:
-                    timer.call()
-                    self.deliver()
-        self._next_due = min(self._due.values())
 
     def before_messages(self) -> None:
         """Hook after the robot's tick; overridden by subclasses."""
@@ -217,6 +214,8 @@ class FlightLoop(Loop):
         epoch: time of the stamps at the start of the simulation [s].
 
     """
+
+    start_timeout = 5.0     # [s] for the estimator; noisy poses can need longer than ARMING_TIME
 
     def __init__(self, robot: RobotParameters, plant: RobotParameters,
                  controllers: dict[str, Controller], recorder: Recorder, *,
@@ -302,7 +301,7 @@ class FlightLoop(Loop):
                 raise RunError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
                                f"'{supervisor.state}' ({'; '.join(events[2::-1])})")
             if not asked and now >= ARMING_TIME - ROUNDING and (
-                    not supervisor.why_not_arm() or now >= START_TIMEOUT):
+                    not supervisor.why_not_arm() or now >= self.start_timeout):
                 asked = True
                 answer = self.request('arm')
                 if not answer:

@@ -99,18 +99,15 @@ class ControllerComponent(Component):
         if not np.isnan(joints.position).any():     # a bridge has lost a servo for the moment
             self._joints = joints.corrected(self._sensors)
 
-    def _check_target(self, target, published):
+    def _on_target(self, target, published):
         # The age counts at publication: a latched target stays valid for a node that starts
         # later. Publication times are system time, so simulated stamps have no age.
         then = None if self.host.simulated or math.isnan(published) else published
+        now = self.host.now()
         reason = self._checks.why_not(target, then) or (
-            self.stepper.too_far(target, self.host.now()) if self.stepper.active else '')
+            self.stepper.too_far(target, now) if self.stepper.active else '')
         if reason:
             raise MessageError(reason, CANNOT_BE_FLOWN)
-
-    def _on_target(self, target, published):
-        self._check_target(target, published)
-        now = self.host.now()
         if target.stamp == 0.0:     # `ros2 topic pub` sets no stamp: valid from now on
             target = target.delayed(now)
         elif target.stamp > now:    # a clock that is ahead must not make it outlast later targets

@@ -1,6 +1,7 @@
 """What surrounds the flight stack as components: the simulated robot, the source of targets."""
 
 from collections.abc import Callable
+from functools import partial
 from math import degrees
 
 import numpy as np
@@ -141,7 +142,7 @@ class TaskReference(Component):
         self.writes('target_pose', 'target_trajectory', 'disturbance', STATE)
         self.follows('supervisor/state', self._on_supervisor)
         if task.kind in WITH_WRENCHES:      # the loss of control ends tasks with rising levels
-            self.reads('odom', self._on_odom, qos=SENSOR)
+            self.reads('odom', partial(setattr, self, '_odom'), qos=SENSOR)
         self.reads('command', self._on_command, expected=False)
         self.report('task', lambda: (OK, self.state, {'task': task.name}))
 
@@ -153,9 +154,6 @@ class TaskReference(Component):
     def state(self) -> str:
         """Newest value of ``reference/state``."""
         return self.newest[STATE]
-
-    def _on_odom(self, odom):
-        self._odom = odom
 
     def _on_supervisor(self, mode):
         if self.state == WAITING and mode.state == FLYING:

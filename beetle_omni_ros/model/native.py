@@ -44,8 +44,23 @@ def built(name: str, source: str, options: Sequence[str] = ()) -> Path:
     digest = hashlib.sha256(key.encode()).hexdigest()[:20]
     cache = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache')
     library = cache / 'beetle_omni_ros' / f'{name}_{digest}.so'
-    if not library.is_file():
-        _compile(compiler.split(), source, options, library)
+    if library.is_file():
+        return library
+    command = compiler.split()
+    try:
+        library.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=library.parent) as build:
+            path, output = Path(build) / 'source.c', Path(build) / library.name
+            path.write_text(source)
+            log.info('compiling %s (once for this model and these options)', library.stem)
+            done = subprocess.run([*command, *FLAGS, str(path), '-o', str(output), *options],
+                                  capture_output=True, text=True, timeout=300)
+            if done.returncode:
+                lines = done.stderr.strip().splitlines() or ['no message']
+                raise RunError(f'{command[0]} failed: {lines[0]}')
+            os.replace(output, library)  # atomic, because other processes may build the same
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise RunError(f'cannot build in {library.parent}: {error}') from None
     return library
 
 
@@ -80,21 +95,3 @@ def buffered(function: ca.Function) -> Callable[..., np.ndarray]:
 
     call.__dict__['buffer'] = buffer    # `evaluate` has its address only
     return call
-
-
-def _compile(compiler, source, options, library):
-    try:
-        library.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=library.parent) as build:
-            path = Path(build) / 'source.c'
-            path.write_text(source)
-            output = Path(build) / library.name
-            log.info('compiling %s (once for this model and these options)', library.stem)
-            done = subprocess.run([*compiler, *FLAGS, str(path), '-o', str(output), *options],
-                                  capture_output=True, text=True, timeout=300)
-            if done.returncode:
-                lines = done.stderr.strip().splitlines() or ['no message']
-                raise RunError(f'{compiler[0]} failed: {lines[0]}')
-            os.replace(output, library)  # atomic, because other processes may build the same
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise RunError(f'cannot build in {library.parent}: {error}') from None

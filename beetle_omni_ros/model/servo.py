@@ -127,19 +127,17 @@ class Step:
         return held, space.where(held == tilt, rate, 0.0)
 
 
-def play(positions: np.ndarray, half: float | np.ndarray,
-         first: np.ndarray | None = None) -> np.ndarray:
+def play(positions: np.ndarray, half: float | np.ndarray) -> np.ndarray:
     """
     Positions (K, ...) of a shaft that is driven with a play of ``half`` to each side [rad].
 
-    ``positions`` (K, ...) are those of the driving side. ``first`` (...) is the first one of the
-    driven side, by default the driving side's.
+    ``positions`` (K, ...) are those of the driving side, on which the shaft begins.
     """
-    made, shown = np.empty_like(positions), positions[0] if first is None else first
-    low, high = positions - half, positions + half
-    for k in range(len(positions)):
-        shown = made[k] = np.minimum(np.maximum(shown, low[k]), high[k])
-    return made
+    made, shown = [], positions[0]
+    for low, high in zip(positions - half, positions + half, strict=True):
+        shown = np.minimum(np.maximum(shown, low), high)
+        made.append(shown)
+    return np.array(made)
 
 
 def _within(space, value, limit):

@@ -50,6 +50,7 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
                                                   clock=self.steady_clock)
             self.try_to_start()
         self._changed()
+        return self
 
     def _changed(self):
         self.component.stage = self.stage
@@ -116,19 +117,15 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
         return response
 
 
-class JointBridgeNode(BridgeNode):
-    """Bridge of the tilt servos."""
-
-    def __init__(self):
-        super().__init__('joint_bridge_node', ServoBusParameters, 'params/servo_bus.yaml',
-                         'servo_bus_file', autostart='none')
-        self.run(bridges.JointBridge(self.parameters, self.robot))
+def joint_bridge_node() -> FlightNode:
+    """Make the node of the bridge of the tilt servos."""
+    node = BridgeNode('joint_bridge_node', ServoBusParameters, 'params/servo_bus.yaml',
+                      'servo_bus_file', autostart='none')
+    return node.run(bridges.JointBridge(node.parameters, node.robot))
 
 
-class RotorBridgeNode(BridgeNode):
-    """Bridge of the motor board."""
-
-    def __init__(self):
-        super().__init__('rotor_bridge_node', MotorBoardParameters, 'params/motor_board.yaml',
-                         'motor_board_file', autostart='activate')
-        self.run(bridges.RotorBridge(self.parameters, self.robot))
+def rotor_bridge_node() -> FlightNode:
+    """Make the node of the bridge of the motor board."""
+    node = BridgeNode('rotor_bridge_node', MotorBoardParameters, 'params/motor_board.yaml',
+                      'motor_board_file', autostart='activate')
+    return node.run(bridges.RotorBridge(node.parameters, node.robot))

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, radians
-from typing import NamedTuple
 
 import numpy as np
 
@@ -171,14 +170,10 @@ def pressed(before: Sequence[int], now: Sequence[int], p: DriveParameters) -> li
             and not (number < len(before) and before[number])]
 
 
-class Action(NamedTuple):
-    """A command of the operator."""
-
-    name: str
-    # Of 'shift' (3,) in world [m] and (3,) roll, pitch, yaw [rad]; of 'goto' (3,) in world [m] and
-    # (4,) body to world, xyzw, or None to keep the attitude; of 'controller' a name; of 'wait'
-    # perhaps seconds.
-    values: tuple = ()
+# A command of the operator, and its values: of 'shift' (3,) in world [m] and (3,) roll, pitch, yaw
+# [rad]; of 'goto' (3,) in world [m] and (4,) body to world, xyzw, or None to keep the attitude; of
+# 'controller' a name, or none for the next one; of 'wait' perhaps seconds.
+Action = tuple[str, tuple]
 
 
 def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Action | None:
@@ -195,34 +190,34 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Action | None:
     if word in WAYS:
         axis, direction = WAYS[word]
         way[axis] = direction * _numbers(word, rest, 'METRES', (1,))[0]
-        return Action('shift', (way, turn))
+        return 'shift', (way, turn)
     if word in TURNS:
         degrees, = _numbers(word, rest, 'DEGREES', (1,))
         if abs(degrees) > MAX_TURN:
             raise ParameterError(f"'{line.strip()}': expected at most {MAX_TURN:g} degrees")
         turn[TURNS[word]] = radians(degrees)
-        return Action('shift', (way, turn))
+        return 'shift', (way, turn)
     if word == 'goto':
         return _pose(_numbers(word, rest, 'X Y Z [ROLL PITCH YAW]', (3, 6)))
     if word == 'controller':
         if len(rest) != 1:
             raise ParameterError("'controller': expected one NAME after it")
-        return Action(word, (rest[0],))
+        return word, (rest[0],)
     if word == 'wait':
         seconds = _numbers(word, rest, 'SECONDS', (0, 1))
         if any(one < 0 for one in seconds):
             raise ParameterError(f"'{line.strip()}': expected SECONDS from 0")
-        return Action(word, tuple(seconds))
+        return word, tuple(seconds)
     if word not in ORDERS and word not in poses:
         raise ParameterError(f"'{word}': expected {HELP}, or a pose of {', '.join(poses)}")
     if rest:
         raise ParameterError(f"'{line.strip()}': expected nothing after '{word}'")
-    return Action(word) if word in ORDERS else _pose(poses[word])
+    return (word, ()) if word in ORDERS else _pose(poses[word])
 
 
 def _pose(values):
     attitude = rotations.from_rpy(*map(radians, values[3:])) if len(values) == 6 else None
-    return Action('goto', (np.array(values[:3], dtype=float), attitude))
+    return 'goto', (np.array(values[:3], dtype=float), attitude)
 
 
 def _numbers(word, texts, wanted, counts):

@@ -21,8 +21,8 @@ from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.rotations import BodyState
 from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.ros import drive, wire
+from beetle_omni_ros.ros.clients import Operator
 from beetle_omni_ros.ros.drive import Action, DriveParameters, Steering
-from beetle_omni_ros.ros.operator import Operator
 from beetle_omni_ros.ros.runner import sigterm_as_interrupt
 
 PERIOD = 0.05           # s between two targets
@@ -198,9 +198,9 @@ def keyboard(driver, p, poses, say):
                     yield found
                     return
                 if shift:
-                    found.append(Action('shift', shift))
+                    found.append(('shift', shift))
                 elif word:
-                    found.append(drive.parse(word, poses) if word in poses else Action(word))
+                    found.append(drive.parse(word, poses) if word in poses else (word, ()))
             yield found
     finally:
         termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
@@ -218,7 +218,7 @@ def joystick(driver, p, poses, say):
             buttons = tuple(driver.buttons)
             way, turn = drive.shift_of_sticks(driver.axes, now - before, p)
             if driver.steering is not None and (way.any() or turn.any()):
-                found.append(Action('shift', (way, turn)))
+                found.append(('shift', (way, turn)))
         before = now
         yield found
 
@@ -242,14 +242,14 @@ def terminal(driver, p, poses, say):
             except ParameterError as error:
                 say(str(error))
                 continue
-            name = action.name if action else ''
+            name, values = action or ('', ())
             if name == 'quit':
                 yield found
                 return
             if name == 'help':
                 say(f"{options}: {', '.join(poses)}")
             elif name == 'wait':
-                wait = driver.time(), action.values[0] if action.values else None
+                wait = driver.time(), values[0] if values else None
             elif action is not None:
                 found.append(action)
         yield found

@@ -27,6 +27,7 @@ from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import find_robot, RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.ros import runner
+from beetle_omni_ros.ros.clients import NEVER, Operator
 from beetle_omni_ros.ros.graph import (
     BRIDGES,
     child_environment,
@@ -38,7 +39,6 @@ from beetle_omni_ros.ros.graph import (
     plan,
     reserved_domain,
 )
-from beetle_omni_ros.ros.operator import NEVER, Operator
 from beetle_omni_ros.ros.runner import REAL_TIME_PRIORITY
 from beetle_omni_ros.show import table
 from beetle_omni_ros.show.page import print_end

@@ -29,15 +29,15 @@ from beetle_omni_ros.model.schema import ParameterError, RunError
 
 BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
 READY = 'ready'         # begin of a bridge's state
-CONTROLLER = 'nodes:ControllerNode'
-# Executable -> module of this folder and class.
-NODES = {'sim_node': 'sim_node:SimNode', 'ekf_node': 'nodes:EkfNode',
+CONTROLLER = 'nodes:controller_node'
+# Executable -> module of this folder and what makes the node.
+NODES = {'sim_node': 'sim_node:SimNode', 'ekf_node': 'nodes:ekf_node',
          'nmpc_node': CONTROLLER, 'rl_node': CONTROLLER,
-         'supervisor_node': 'nodes:SupervisorNode',
-         'joint_bridge_node': 'bridge_nodes:JointBridgeNode',
-         'rotor_bridge_node': 'bridge_nodes:RotorBridgeNode',
-         'reference_node': 'nodes:ReferenceNode', 'recorder_node': 'nodes:RecorderNode',
-         'viewer_node': 'nodes:ViewerNode'}
+         'supervisor_node': 'nodes:supervisor_node',
+         'joint_bridge_node': 'bridge_nodes:joint_bridge_node',
+         'rotor_bridge_node': 'bridge_nodes:rotor_bridge_node',
+         'reference_node': 'nodes:reference_node', 'recorder_node': 'nodes:RecorderNode',
+         'viewer_node': 'nodes:viewer_node'}
 # Parameter autostart of a bridge -> lifecycle state to reach.
 AUTOSTART = {'none': '', 'configure': 'inactive', 'activate': 'active'}
 COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes

@@ -5,6 +5,8 @@ ROS ignores an override of an undeclared key, and a bad value causes a traceback
 of the parameter files refuse both at the start of the node, in one line that names the key.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import make_dataclass, MISSING
 from functools import partial
@@ -75,8 +77,8 @@ class FlightNode(Node):
         """Robot of the parameter robot_file."""
         return RobotParameters.load(self.parameters.robot_file or None)
 
-    def run(self, component: Component) -> None:
-        """Connect a component to its topics, timers and services."""
+    def run(self, component: Component) -> FlightNode:
+        """Connect a component to its topics, timers and services; return this node."""
         self.component = component
         component.name = self.get_name()
         for topic in (*component.outputs, 'diagnostics'):
@@ -95,6 +97,7 @@ class FlightNode(Node):
             self.create_service(Trigger, f'~/{service}', partial(_answer, answer))
         self.create_timer(DIAGNOSTICS_PERIOD, lambda: self.publish(
             'diagnostics', component.diagnostics()), clock=self.steady_clock)
+        return self
 
     def _receive(self, topic, entry, data, published=None):
         component = self.component
@@ -152,13 +155,11 @@ class FlightNode(Node):
         self._claim.close()
 
 
-class ComponentNode(FlightNode):
-    """Node of a component of others; ``reference`` is that of its class."""
-
-    def __init__(self, kind: type[Component], reference: str):
-        super().__init__(node_name(kind), robot_file=file_parameter(),
-                         component=parameter(reference, doc='component that this node runs'))
-        self.run(kind(self.robot))      # type: ignore[arg-type]
+def component_node(kind: type[Component], reference: str) -> FlightNode:
+    """Make the node of a component of others; ``reference`` is that of its class."""
+    node = FlightNode(node_name(kind), robot_file=file_parameter(),
+                      component=parameter(reference, doc='component that this node runs'))
+    return node.run(kind(node.robot))       # type: ignore[arg-type]
 
 
 def _answer(service, _, response):

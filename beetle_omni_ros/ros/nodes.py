@@ -21,70 +21,59 @@ from beetle_omni_ros.ros.node import file_parameter, FlightNode
 from beetle_omni_ros.supervisor.interface import SupervisorParameters
 
 
-class EkfNode(FlightNode):
-    """Node of the state estimator."""
-
-    def __init__(self):
-        super().__init__('ekf_node', EkfParameters, 'params/ekf.yaml', 'ekf_file',
-                         robot_file=file_parameter())
-        self.run(Estimator(self.parameters, self.robot))
+def ekf_node() -> FlightNode:
+    """Make the node of the state estimator."""
+    node = FlightNode('ekf_node', EkfParameters, 'params/ekf.yaml', 'ekf_file',
+                      robot_file=file_parameter())
+    return node.run(Estimator(node.parameters, node.robot))
 
 
-class ControllerNode(FlightNode):
-    """Node of a controller; an exception of the controller is logged and reported."""
-
-    def __init__(self, entry: ControllerEntry):
-        more = {} if f'{entry.name}_node' in NODES else {'controller': parameter(
-            entry.reference, doc='controller that this node runs')}
-        super().__init__(f'{entry.name}_node', entry.parameter_class, entry.parameters_file,
-                         f'{entry.name}_file', robot_file=file_parameter(), **more)
-        robot = self.robot
-        self.run(ControllerComponent(entry.name, entry.make(
-            robot, parameters=self.parameters if entry.parameter_class else None), robot))
+def controller_node(entry: ControllerEntry) -> FlightNode:
+    """Make the node of a controller, whose exceptions are logged and reported."""
+    more = {} if f'{entry.name}_node' in NODES else {'controller': parameter(
+        entry.reference, doc='controller that this node runs')}
+    node = FlightNode(f'{entry.name}_node', entry.parameter_class, entry.parameters_file,
+                      f'{entry.name}_file', robot_file=file_parameter(), **more)
+    robot = node.robot
+    return node.run(ControllerComponent(entry.name, entry.make(
+        robot, parameters=node.parameters if entry.parameter_class else None), robot))
 
 
-class SupervisorNode(FlightNode):
-    """Node of the supervisor; its parameter controller selects the active one, in flight too."""
-
-    component: SupervisorComponent
-
-    def __init__(self):
-        controllers = parameter(
-            registry.STANDING_BY,
-            doc='controllers that may be active: registered names, or FILE.py:Class')
-        super().__init__('supervisor_node', SupervisorParameters, 'params/supervisor.yaml',
-                         'supervisor_file', self._changed, changeable=('controller',),
-                         controllers=controllers, robot_file=file_parameter())
-        names = [registry.find(name).name if ':' in name else name
-                 for name in self.parameters.controllers]
-        if self.parameters.controller not in names:
-            raise ParameterError(f"key 'controller': expected one of {', '.join(names)}, found "
-                                 f"'{self.parameters.controller}'")
-        self.run(SupervisorComponent(self.parameters, self.robot, names))
-
-    def _changed(self, new):
-        answer = self.component.select(new.controller)
+def supervisor_node() -> FlightNode:
+    """Make that of the supervisor; its parameter controller selects the active one, also later."""
+    def changed(new):
+        answer = component.select(new.controller)
         if not answer:
             raise ParameterError(f"key 'controller': {answer.text}")
+
+    controllers = parameter(registry.STANDING_BY, doc=(
+        'controllers that may be active: registered names, or FILE.py:Class'))
+    node = FlightNode('supervisor_node', SupervisorParameters, 'params/supervisor.yaml',
+                      'supervisor_file', changed, changeable=('controller',),
+                      controllers=controllers, robot_file=file_parameter())
+    given = node.parameters
+    names = [registry.find(name).name if ':' in name else name for name in given.controllers]
+    if given.controller not in names:
+        raise ParameterError(f"key 'controller': expected one of {', '.join(names)}, found "
+                             f"'{given.controller}'")
+    component = SupervisorComponent(given, node.robot, names)
+    return node.run(component)
+
+
+def reference_node() -> FlightNode:
+    """Make the node of the targets of a task."""
+    node = FlightNode('reference_node',
+                      task=parameter('hover', doc='name of a task, or a CSV file of poses'),
+                      seed=parameter(0, doc='seed of random poses', low=0, high=2**31 - 1))
+    payload = node.create_client(SetParameters, 'sim_node/set_parameters')
+    return node.run(TaskReference(
+        make_task(node.parameters.task, node.parameters.seed),
+        lambda mass: payload.call_async(wire.parameter_request('payload', mass))))
 
 
 LINE = 'rcl_interfaces/msg/Log'
 WRITE_PERIOD = 0.02     # s between writes of the received messages, so that no callback waits
 FLUSH_WRITES = 20       # writes between flushes; a crash loses only messages after the last one
-
-
-class ReferenceNode(FlightNode):
-    """Node of the targets of a task."""
-
-    def __init__(self):
-        super().__init__(
-            'reference_node',
-            task=parameter('hover', doc='name of a task, or a CSV file of poses'),
-            seed=parameter(0, doc='seed of random poses', low=0, high=2**31 - 1))
-        payload = self.create_client(SetParameters, 'sim_node/set_parameters')
-        self.run(TaskReference(
-            make_task(self.parameters.task, self.parameters.seed),
-            lambda mass: payload.call_async(wire.parameter_request('payload', mass))))
 
 
 class RecorderNode(FlightNode):
@@ -159,19 +148,14 @@ class RecorderNode(FlightNode):
         self._bag = None
 
 
-class ViewerNode(FlightNode):
-    """Publishes description and frames of the robot for RViz and Foxglove, like those of a bag."""
-
-    def __init__(self):
-        super().__init__('viewer_node')
-        self._outputs = {     # tf2_msgs is not on PyPI
-            name: self.create_publisher(wire.message_class(kind), name, wire.profile(qos))
-            for name, (kind, qos) in FRAMES.items()}
-        frames = FrameWriter(self._write, '')
-        for topic in ('odom', 'joint_states'):
-            wire.subscribe_raw(self, topic, lambda data, topic=topic: frames.take(
-                topic, data, self.now()), SENSOR)
-        self.run(Component('viewer_node'))
-
-    def _write(self, topic, kind, data, t):
-        self._outputs[topic].publish(bytes(data))
+def viewer_node() -> FlightNode:
+    """Make that of description and frames for RViz and Foxglove, like those of a bag."""
+    node = FlightNode('viewer_node')
+    outputs = {     # tf2_msgs is not on PyPI
+        name: node.create_publisher(wire.message_class(kind), name, wire.profile(qos))
+        for name, (kind, qos) in FRAMES.items()}
+    frames = FrameWriter(lambda topic, kind, data, t: outputs[topic].publish(bytes(data)), '')
+    for topic in ('odom', 'joint_states'):
+        wire.subscribe_raw(node, topic, lambda data, topic=topic: frames.take(
+            topic, data, node.now()), SENSOR)
+    return node.run(Component('viewer_node'))

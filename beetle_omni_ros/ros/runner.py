@@ -23,7 +23,7 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.flight.component import Component
 from beetle_omni_ros.model.schema import load_yaml, ParameterError, RunError
 from beetle_omni_ros.ros.graph import COMPOSED, confine, CONTROLLER, NODES
-from beetle_omni_ros.ros.node import ComponentNode
+from beetle_omni_ros.ros.node import component_node
 
 OK, FAILED, UNUSABLE = 0, 1, 2
 # s; without a timeout, the events executor of Jazzy dispatches no callbacks.
@@ -39,7 +39,7 @@ def maker(name: str) -> Callable:
     """Import what makes the node of an executable, or of a controller by name or reference."""
     if ':' in name and isinstance(kind := registry.loaded(name), type) \
             and issubclass(kind, Component):
-        return partial(ComponentNode, kind, name)
+        return partial(component_node, kind, name)
     place = NODES.get(name, CONTROLLER)
     module, _, kind = place.partition(':')
     made = getattr(import_module(f'{__package__}.{module}'), kind)

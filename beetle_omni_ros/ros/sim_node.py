@@ -172,7 +172,11 @@ class SimNode(FlightNode):
             conditions=given.conditions, seed=given.seed)
         self._pacing = self._make_pacing(given)
         if given.actuators == 'emulated':
-            self._devices = self._make_devices(given, robot)
+            self._devices = EmulatedActuators.of(
+                self._simulator, robot, ServoBusParameters.load(given.servo_bus_file or None),
+                seed=given.seed, servo_port=given.servo_port, board_port=given.board_port)
+            self.get_logger().info(f'servos at {self._devices.bus.port}, motor board at '
+                                   f'{self._devices.board.port}')
         self._changed(given)
         component = SimulatedRobot(self._simulator, robot, self._devices)
         component.report('pacing', self._pacing_status)
@@ -197,15 +201,6 @@ class SimNode(FlightNode):
     def now(self) -> float:
         """Return ROS time [s]; this node is the source of simulated time."""
         return super().now() if self._clock_publisher is None else self._pacing.now
-
-    def _make_devices(self, given, robot):
-        """Connect emulated devices to the plant, for the drivers of the bridges."""
-        servos = ServoBusParameters.load(given.servo_bus_file or None)
-        devices = EmulatedActuators.of(self._simulator, robot, servos, seed=given.seed,
-                                       servo_port=given.servo_port, board_port=given.board_port)
-        self.get_logger().info(f'servos at {devices.bus.port}, motor board at '
-                               f'{devices.board.port}')
-        return devices
 
     def close(self) -> None:
         """Switch the emulated devices off."""

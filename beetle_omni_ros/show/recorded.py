@@ -167,7 +167,7 @@ class Newest(Recorder):
 
 
 def draw(server: viser.ViserServer, graph) -> None:
-    """Draw a :class:`~beetle_omni_ros.ros.listeners.LiveGraph` as it runs, until Ctrl-C."""
+    """Draw a :class:`~beetle_omni_ros.ros.clients.LiveGraph` as it runs, until Ctrl-C."""
     newest, room = Newest(), Room(server)
     label = server.scene.add_label('/label', '', anchor='bottom-center',
                                    position=(0.0, 0.0, LABEL_HEIGHT))

@@ -338,7 +338,13 @@ class Inputs:
             return 0.0
         if now < before:
             self.say(WARNING, f'the clock went back by {before - now:.3f} s')
-            self._forget_stamps(now, before - now)
+            # accept new stamps
+            self.estimate = replace(self.estimate, stamp=min(self.estimate.stamp, now))
+            self.tilt_stamp = min(self.tilt_stamp, now)
+            self.backup.forget(before - now)
+            self.watch.restart()
+            for stream in self.streams.values():
+                stream.forget()
             return 0.0
         dt = min(now - before, TICK_LIMIT)
         for source in (self.ekf, self.joints, self.imu, self.mocap, self.rotors):
@@ -358,15 +364,6 @@ class Inputs:
         self._lost_for = self._lost_for + dt if lost else 0.0
         self.lost = self._lost_for >= LOST_TIME
         return dt
-
-    def _forget_stamps(self, now: float, by: float) -> None:
-        """Accept new stamps after the clock was set back by ``by`` [s]."""
-        self.estimate = replace(self.estimate, stamp=min(self.estimate.stamp, now))
-        self.tilt_stamp = min(self.tilt_stamp, now)
-        self.backup.forget(by)
-        self.watch.restart()
-        for stream in self.streams.values():
-            stream.forget()
 
     def _ahead(self, stamp: float) -> bool:
         return self._now is not None and stamp - self._now > ESTIMATE_TIMEOUT

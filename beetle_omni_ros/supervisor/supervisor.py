@@ -241,7 +241,14 @@ class Supervisor:
                 self._watch.name('rotor_bridge_lost', now)
                 self.emergency_stop(now, no_rotors)
         elif self.state == mode.LANDING:
-            self._limit_landing(now)
+            if self._in_state < RECOVERY_TIME:
+                return
+            if inputs.outside(FENCE_MARGIN):
+                self.emergency_stop(now, 'left the fence while landing')
+            elif inputs.lost:
+                self.emergency_stop(now, 'tumbling or falling while landing')
+            elif self._in_state > LANDING_LIMIT:
+                self.emergency_stop(now, f'no ground within {LANDING_LIMIT:g} s of landing')
         elif self.state == mode.FALLBACK and self._in_state > FALLBACK_TIME:
             text = f'{self.active}_node not good for {self._in_state:.0f} s: landing'
             self._land(now, ERROR, text, 'controller_lost')
@@ -251,17 +258,6 @@ class Supervisor:
             self._watch.name('control_lost', now)
             self._fall_back(ERROR, f'tumbling or falling under {self.active}_node: fallback '
                                    'to hover')
-
-    def _limit_landing(self, now):
-        """Limits of a landing, after it had time to recover the robot."""
-        if self._in_state < RECOVERY_TIME:
-            return
-        if self.inputs.outside(FENCE_MARGIN):
-            self.emergency_stop(now, 'left the fence while landing')
-        elif self.inputs.lost:
-            self.emergency_stop(now, 'tumbling or falling while landing')
-        elif self._in_state > LANDING_LIMIT:
-            self.emergency_stop(now, f'no ground within {LANDING_LIMIT:g} s of landing')
 
     # One function for each state --------------------------------------------------------------
 

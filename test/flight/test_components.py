@@ -340,11 +340,3 @@ def test_a_class_that_is_no_component_is_refused(tmp_path):
     with pytest.raises(ParameterError, match="^component 'gone.py:Own': no such file"):
         component_class('gone.py:Own')
     assert node_name(component_class(OBSERVER)) == 'wrench_observer_node'
-
-
-def test_the_graph_runs_it_as_a_node_of_its_own():
-    graph = pytest.importorskip('beetle_omni_ros.ros.graph')
-    nodes, _ = graph.plan('hover', actuators='direct', components=[OBSERVER])
-    assert nodes['wrench_observer_node'] == {'component': OBSERVER}
-    assert graph.plan('hover', bag='b', components=[OBSERVER])[0]['recorder_node'][
-        'components'] == [OBSERVER]

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from beetle_omni_ros.cli import app
-from beetle_omni_ros.flight.improve import compared, conclusions, ERRORS, is_worse
+from beetle_omni_ros.flight.experiment import compared, conclusions, ERRORS, is_worse
 
 
 def poses(values, reached=True):

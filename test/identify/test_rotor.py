@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from rotor_logs import bench, HEADER, PACKS, RATIO, SERIES, series, stand, SURFACE, write
 
+from beetle_omni_ros.identify.command import rotor_values, write_measured
 from beetle_omni_ros.identify.inference.noise import interval
-from beetle_omni_ros.identify.measured import rotor_values, write_measured
 from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
 from beetle_omni_ros.identify.rotor.results import identify_rotor, rotor_results
 from beetle_omni_ros.model.files import LogError

@@ -12,8 +12,8 @@ from witness import running_graph
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.ros import wire
+from beetle_omni_ros.ros.clients import Operator
 from beetle_omni_ros.ros.graph import reserved_domain
-from beetle_omni_ros.ros.operator import Operator
 
 JOINT, ROTOR = 'joint_bridge_node', 'rotor_bridge_node'
 WITHIN = 40     # [s] timeout of expected events on a busy machine

@@ -8,7 +8,7 @@ from rclpy.parameter import Parameter
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.ros import graph
-from beetle_omni_ros.ros.nodes import SupervisorNode
+from beetle_omni_ros.ros.nodes import supervisor_node
 from beetle_omni_ros.ros.runner import maker
 
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
@@ -17,7 +17,7 @@ OWN, OBSERVER = (f'{EXAMPLES}/own_controller.py:PoseController',
 
 
 def test_the_supervisor_selects_among_the_listed_controllers(make):
-    node = make(SupervisorNode, f"controllers:=['nmpc','{OWN}']", 'controller:=pose_controller')
+    node = make(supervisor_node, f"controllers:=['nmpc','{OWN}']", 'controller:=pose_controller')
 
     def put(name, value):
         return node.set_parameters([Parameter(name, value=value)])[0]
@@ -31,7 +31,7 @@ def test_the_supervisor_selects_among_the_listed_controllers(make):
 
 def test_an_active_controller_outside_the_supervisors_list_is_refused(make):
     with pytest.raises(ParameterError, match="'controller': expected one of nmpc, rl, found 'x'"):
-        make(SupervisorNode, 'controller:=x')
+        make(supervisor_node, 'controller:=x')
 
 
 def test_the_plan_of_a_graph_with_another_controller(tmp_path):

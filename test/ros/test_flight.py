@@ -5,7 +5,7 @@ Each test has its own ROS domain and folders, so that tests can run at the same
 time. The robot is observed through ground_truth/odom, which does not depend on other nodes.
 """
 
-from contextlib import contextmanager
+from contextlib import closing
 import os
 from pathlib import Path
 import re
@@ -24,6 +24,7 @@ from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.bags.bag_writer import BagWriter
 from beetle_omni_ros.bags.metrics import metrics
 from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.model.schema import RunError
 from beetle_omni_ros.ros import fly as fly_module
 from beetle_omni_ros.ros.graph import Graph, in_simulated_time
 
@@ -90,12 +91,12 @@ def loses_one_node_after_another(graph, witness, bag):
     assert witness.truth.position[2] < 0.4 and np.linalg.norm(witness.truth.velocity) < 0.1
     assert np.all(witness.last_command[1].thrust == 0)
     assert set(graph.dead()) == {'recorder_node', 'reference_node', 'nmpc_node', 'ekf_node'}
-    assert 'SIGKILL' in graph.dead()['ekf_node']
+    flight = fly_module.Flight(graph, 'nmpc', make_task('hover'), print)
+    with closing(flight), pytest.raises(RunError, match=r'ekf_node died \(ended by SIGKILL\)'):
+        flight.spin(0.0)
 
 
-@contextmanager
-def flying(tmp_path):
-    """Fly ten poses by the command line; yield process and bag in flight."""
+def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
     task, bag, temporary = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'tmp'
     task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
     temporary.mkdir()
@@ -109,28 +110,14 @@ def flying(tmp_path):
         while not any(b'flying:nmpc' in file.read_bytes() for file in bag.glob('*.mcap')):
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.2)
-        yield process, bag
-    finally:
-        process.kill()
-        process.communicate()
-    assert not list(temporary.iterdir())
-
-
-def test_a_killed_process_is_named(tmp_path):
-    with flying(tmp_path) as (process, bag):
-        child, = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
-        os.kill(int(child), signal.SIGKILL)
-        _, error = process.communicate(timeout=30)      # nobody waits for its answer
-    assert process.returncode == 1
-    assert 'composed died (ended by SIGKILL)' in error
-
-
-def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
-    with flying(tmp_path) as (process, bag):
         for _ in range(2):
             process.send_signal(signal.SIGTERM)
             time.sleep(0.1)
         printed, error = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.communicate()
+    assert not list(temporary.iterdir())
     first, *lines = printed.splitlines()
     assert first.startswith('to watch: beetle_omni view --domain-id ')
     assert 'interrupted at ' in printed and lines[-5:-2] == [
@@ -187,13 +174,6 @@ def test_a_fall_in_the_landing_is_the_last_line_with_its_likely_cause(tmp_path, 
     else:
         assert not err and '\nthis computer was too slow\nfiles: ' in out
     assert 'landing [m/s]' in out
-
-
-def test_the_computer_was_too_slow_if_the_simulator_lost_time_in_the_flight():
-    flight = object.__new__(fly_module.Flight)
-    for before, lost, slow in ((0.0, 0.4, True), (0.4, 0.45, False), (float('inf'), 3.0, False)):
-        flight._lost_before, flight._lost_time = before, lambda lost=lost: lost
-        assert ('try --clock simulated' in flight.slow()) is slow
 
 
 def test_a_full_disk_ends_the_flight_with_one_line_and_the_bag_is_readable(tmp_path):

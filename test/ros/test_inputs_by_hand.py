@@ -6,7 +6,7 @@ import pytest
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.ros import drive
-from beetle_omni_ros.ros.drive import Action, DriveParameters, parse
+from beetle_omni_ros.ros.drive import DriveParameters, parse
 
 
 @pytest.fixture(scope='module')
@@ -51,13 +51,13 @@ def test_commands_that_shift_the_target(p, line, way, turn):
 def test_commands_that_go_to_poses_and_that_request_actions(p):
     name, over = parse('over', p.poses)
     assert name == 'goto' and rotations.matrix(over[1])[2, 2] == pytest.approx(-1)
-    position, quaternion = parse('goto 1 0 1.5', p.poses).values
+    _, (position, quaternion) = parse('goto 1 0 1.5', p.poses)
     assert position == pytest.approx([1, 0, 1.5]) and quaternion is None
-    _, turned = parse('goto 1 0 1.5 0 0 90', p.poses).values
+    _, (_, turned) = parse('goto 1 0 1.5 0 0 90', p.poses)
     assert turned == pytest.approx([0, 0, 0.5 ** 0.5, 0.5 ** 0.5])
-    assert parse('arm', p.poses) == Action('arm')
-    assert parse('controller rl', p.poses) == Action('controller', ('rl',))
-    assert parse('wait 2', p.poses) == Action('wait', (2.0,))
+    assert parse('arm', p.poses) == ('arm', ())
+    assert parse('controller rl', p.poses) == ('controller', ('rl',))
+    assert parse('wait 2', p.poses) == ('wait', (2.0,))
     assert parse('', p.poses) is None and parse('# nothing', p.poses) is None
 
 

@@ -17,10 +17,10 @@ from beetle_omni_ros.drivers.check import check_topics
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.readings import ImuReading, JointReading, PoseReading
 from beetle_omni_ros.model.rotations import BodyState
-from beetle_omni_ros.ros import listeners, wire
+from beetle_omni_ros.ros import clients, wire
+from beetle_omni_ros.ros.clients import Client, listen, LiveGraph
 from beetle_omni_ros.ros.graph import claim, domains_in_use
-from beetle_omni_ros.ros.listeners import Client, listen, LiveGraph
-from beetle_omni_ros.ros.nodes import ViewerNode
+from beetle_omni_ros.ros.nodes import viewer_node
 from beetle_omni_ros.show.recorded import Newest
 
 pytestmark = pytest.mark.real_time
@@ -86,12 +86,12 @@ def test_the_view_names_the_domains_with_a_flight_and_shows_the_only_one(
         assert f'in ROS domain {ros_domain}; ' in graph.waits()
         assert '--domain-id 230, --domain-id 231' in graph.waits()
     shown = []
-    monkeypatch.setattr(listeners, 'LiveGraph', lambda namespace, domain: shown.append(domain))
-    monkeypatch.setattr(listeners, 'domains_in_use', lambda: [230])
+    monkeypatch.setattr(clients, 'LiveGraph', lambda namespace, domain: shown.append(domain))
+    monkeypatch.setattr(clients, 'domains_in_use', lambda: [230])
     for environment in ('', '5'):
         monkeypatch.setenv('ROS_DOMAIN_ID', environment)
         with suppress(AttributeError):      # of the graph that is not made
-            listeners.run_live(host='127.0.0.1', port=8080)
+            clients.run_live(host='127.0.0.1', port=8080)
     assert shown == [230, None]
 
 
@@ -122,7 +122,7 @@ def test_messages_become_a_moment(make_bench, ros_domain):
 def test_the_viewer_node_publishes_description_and_frames(bench, monkeypatch):
     monkeypatch.setattr(wire, 'message_class', lambda name, real=wire.message_class: (
         String if name.startswith('tf2') else real(name)))      # tf2_msgs is not on PyPI
-    bench.add(ViewerNode())
+    bench.add(viewer_node())
     received, odom, joints = {}, *(wire.Publisher(bench.user, name)
                                    for name in ('odom', 'joint_states'))
     for name, (kind, qos) in FRAMES.items():

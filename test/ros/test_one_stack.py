@@ -21,8 +21,8 @@ from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.loop import ARMING_TIME, FlightLoop
 from beetle_omni_ros.flight.surroundings import TaskReference
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.ros.clients import Operator
 from beetle_omni_ros.ros.graph import COMPOSED, in_simulated_time
-from beetle_omni_ros.ros.operator import Operator
 from beetle_omni_ros.sim.faults import parse_faults
 
 ARM, FAULT, SWITCH, LAND, END = ARMING_TIME, 5.0, 6.5, 8.0, 15.0   # [s] of the simulation

@@ -30,7 +30,7 @@ def finish(process, timeout=20):
 
 def wait_until_it_spins(process):
     """Wait until a node publishes; from then on it handles signals."""
-    from beetle_omni_ros.ros.operator import Operator
+    from beetle_omni_ros.ros.clients import Operator
     operator = Operator(int(os.environ['ROS_DOMAIN_ID']))
     try:
         assert operator.wait(lambda: operator.diagnostics, 15), 'no diagnostics'

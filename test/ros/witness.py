@@ -12,8 +12,8 @@ from rclpy.experimental.events_executor import EventsExecutor
 
 from beetle_omni_ros.bags.topics import EVENT, SENSOR
 from beetle_omni_ros.ros import wire
+from beetle_omni_ros.ros.clients import Operator
 from beetle_omni_ros.ros.graph import COMPOSED, Graph
-from beetle_omni_ros.ros.operator import Operator
 
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
 BUSY = 0.85         # share of a core above which tests are not valid

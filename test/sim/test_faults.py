@@ -90,24 +90,20 @@ def healthy():
 
 
 @pytest.mark.parametrize('kind', ROBOT_KINDS)
-def test_a_fault_kind_changes_its_quantity_from_its_start_only(kind, healthy):
-    frames, _ = flight(some(kind, at=0.2))
+def test_a_fault_kind_changes_its_quantity_from_its_start_and_a_sensor_fault_to_its_end(
+        kind, healthy):
+    ends = {} if kind in PHYSICAL or not SENSING[kind] else {'duration': 0.2}
+    frames, simulator = flight(some(kind, at=0.2, **ends))
     assert differing(frames[:40], healthy[:40]) == set()
     changed = differing(frames, healthy, 40)
+    if ends:
+        assert differing(frames, healthy, 130) == set() and simulator.faults == []
     if kind in PHYSICAL:
         assert 'truth' in changed
     elif kind.startswith('battery_') and kind != 'battery_unread':
         assert 'battery' in changed
     else:
         assert changed == SENSING[kind]
-
-
-@pytest.mark.parametrize('kind', sorted(
-    kind for kind in set(ROBOT_KINDS) - PHYSICAL if SENSING[kind]))
-def test_after_a_sensor_fault_the_readings_are_unchanged(kind, healthy):
-    frames, simulator = flight(some(kind, at=0.1, duration=0.2))
-    assert differing(frames, healthy, 110) == set()
-    assert simulator.faults == []
 
 
 def test_rotor_speeds_come_at_50_hz_and_are_those_of_the_thrust():

@@ -18,23 +18,6 @@ def single(values):
     return torch.tensor(np.asarray(values), dtype=torch.float32)
 
 
-def test_matrices_products_and_exponentials_agree_with_scipy():
-    a, b = rotations(200, 0), rotations(200, 1)
-    np.testing.assert_allclose(batch.matrix(single(a.as_quat())), a.as_matrix(), atol=1e-6)
-    np.testing.assert_allclose(
-        batch.matrix(batch.product(single(a.as_quat()), single(b.as_quat()))),
-        (a * b).as_matrix(), atol=1e-6)
-    vector = np.random.default_rng(2).normal(size=(200, 3))
-    vector[:3] = [0, 0, 0], [1e-9, 0, 0], [0, 0, 3.1415]
-    np.testing.assert_allclose(batch.matrix(batch.from_rotation_vector(single(vector))),
-                               Rotation.from_rotvec(vector).as_matrix(), atol=1e-6)
-    np.testing.assert_allclose(batch.transpose_product(single(a.as_matrix()), single(vector)),
-                               a.inv().apply(vector), atol=1e-6)
-    np.testing.assert_allclose(
-        batch.transpose_product(single(a.as_matrix()), single(b.as_matrix())),
-        (a.inv() * b).as_matrix(), atol=1e-6)
-
-
 @pytest.mark.parametrize('angle', [0.0, 1e-3, 1.0, np.pi])
 def test_the_geodesic_is_exact_at_all_angles(angle):
     a = rotations(100, 6)

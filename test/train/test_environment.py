@@ -239,22 +239,6 @@ def test_extreme_actions_never_give_nan():
     assert env.read_tally()['deaths'] == 0     # it is reset
 
 
-def test_a_late_rate_enters_the_estimate_as_a_torque():
-    env = quiet({**only('hold'), 'memory': True}, robots=2)
-    s, n = env.state, env.num_envs
-    history = torch.randn(n, 6, 3, generator=torch.Generator().manual_seed(0))    # newest first
-    x = s['x'].clone()
-    x[:, model.RATE], s['x'][:, model.RATE] = history[:, 0], history[:, 1]
-    s['past_motion'][:, :, 3:] = history[:, 2:]
-    s['delays'][:, 2] = torch.tensor([0.0, 0.02])
-    change = env._delay_error(s, x)
-    assert not change[0].any()
-    steps = history[1, :-1] - history[1, 1:]
-    torch.testing.assert_close(change[1], steps[2] - steps[0])
-    s['extrapolated'].fill_(1.0)
-    torch.testing.assert_close(env._delay_error(s, x)[1], 3 * steps[2] - 2 * steps[3] - steps[0])
-
-
 def test_the_tally_counts_targets_and_reached_targets():
     env = quiet({**only('hold'), 'episode.target_time': [1.0, 1.0]}, robots=10)
     env.state['target_left'].fill_(1)

@@ -93,17 +93,6 @@ def test_extrapolation_removes_the_delay_of_a_ramp_and_reduces_that_of_a_swing(d
     assert wrong <= 0.45 * (delayed(swings, spans) - swings[:, 0]).abs().max() + 1e-6
 
 
-def test_extrapolation_amplifies_the_noise_of_the_rate():
-    env = quiet({'random.rate_noise': 0.04, 'random.noise_power': 0.0,
-                 'random.velocity_latency': [0.02, 0.02], 'random.carried_share': 0.5},
-                robots=4000)
-    extrapolates = env.state['extrapolated'][:, 0] > 0.5
-    assert 0.45 < extrapolates.float().mean() < 0.55
-    spread = {kind: widths(env, env.cfg.random)['rate'][mask].std()
-              for kind, mask in (('delayed', ~extrapolates), ('extrapolated', extrapolates))}
-    assert spread['extrapolated'] / spread['delayed'] == pytest.approx(13 ** 0.5, rel=0.05)
-
-
 def widths(env, random, seed=1):
     """Errors of the signals of many robots."""
     s = env.state

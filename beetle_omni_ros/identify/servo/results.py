@@ -73,26 +73,28 @@ def interval(search: Search, trial: ServoModel, unit: int, name: str) -> tuple[f
     return max(float(low), TERMS[name].low), min(float(high), TERMS[name].high)
 
 
-class Line:
+def fitted_line(log: JointLog, joint: int, rows: np.ndarray) -> tuple[float, float, float]:
     """
-    Readings = slope command(t - delay) + offset, fitted to some rows of a joint.
+    Delay, slope and offset of readings = slope command(t - delay) + offset at rows of a joint.
 
     The competitor of the servo model: 3 numbers without friction and bandwidth.
     """
+    read, size = log.measured[joint, rows], np.inf
+    for delay in DELAYS:
+        late = np.stack([log.command_at(joint, log.read_t[rows] - delay), np.ones(len(rows))])
+        slope, offset = np.linalg.lstsq(late.T, read, rcond=None)[0]
+        error = np.mean((slope * late[0] + offset - read)**2)
+        if error < size:
+            size, best = error, (float(delay), float(slope), float(offset))
+    return best
 
-    def __init__(self, log: JointLog, joint: int, rows: np.ndarray):
-        read, size = log.measured[joint, rows], np.inf
-        for delay in DELAYS:
-            late = np.stack([log.command_at(joint, log.read_t[rows] - delay), np.ones(len(rows))])
-            fitted = np.linalg.lstsq(late.T, read, rcond=None)[0]
-            error = np.mean((fitted @ late - read)**2)
-            if error < size:
-                size, self.delay, (self.slope, self.offset) = error, delay, fitted
 
-    def errors(self, log: JointLog, joint: int, rows: np.ndarray) -> np.ndarray:
-        """Prediction minus reading [rad] at fresh rows."""
-        return self.slope * log.command_at(joint, log.read_t[rows] - self.delay) + self.offset \
-            - log.measured[joint, rows]
+def line_errors(line: tuple[float, float, float], log: JointLog, joint: int, rows: np.ndarray
+                ) -> np.ndarray:
+    """Prediction of a line minus reading [rad] at fresh rows."""
+    delay, slope, offset = line
+    return slope * log.command_at(joint, log.read_t[rows] - delay) + offset \
+        - log.measured[joint, rows]
 
 
 def left_out_rms(search: Search, unit: int) -> tuple[float, float]:
@@ -103,8 +105,8 @@ def left_out_rms(search: Search, unit: int) -> tuple[float, float]:
     read, slopes = s.readings(k, fit.theta[mine], mask(search.chosen.entries))
     moved = slopes[:, joint].T @ fit.s[unit] @ fit.deviations.T
     servo = read[joint] - s.logs[k].measured[joint, rows] + moved[np.arange(len(rows)), block]
-    line = [Line(s.logs[k], joint, rows[block != b]).errors(s.logs[k], joint, rows[block == b])
-            for b in np.unique(block)]
+    line = [line_errors(fitted_line(s.logs[k], joint, rows[block != b]), s.logs[k], joint,
+                        rows[block == b]) for b in np.unique(block)]
     return rms(servo), rms(np.concatenate(line))
 
 
@@ -125,11 +127,11 @@ def _joint(search, unit, validations, robot):
     values, first, last = search.values()[unit], slice(0, log.end), slice(log.end, None)
     known = [(other, other.joints.index(number) if number in other.joints else None)
              for other in validations]
-    line, apart = Line(log, index, search.servos.rows[0]), left_out_rms(search, unit)
+    line, apart = fitted_line(log, index, search.servos.rows[0]), left_out_rms(search, unit)
     best = 'servo' if apart[0] <= apart[1] else 'line'
 
     def of_line(other, k, part=slice(None)):
-        return rms(line.errors(other, k, np.arange(len(other.t))[part][other.fresh[part]]))
+        return rms(line_errors(line, other, k, np.arange(len(other.t))[part][other.fresh[part]]))
 
     def predicted(other, k, part=slice(None)):
         return error_rms(other, k, values, part=part) if best == 'servo' else of_line(
@@ -139,8 +141,8 @@ def _joint(search, unit, validations, robot):
     return {
         'joint': number, 'best': best,
         'left_out_rms_rad': dict(zip(('servo', 'line'), apart, strict=True)),
-        'line': {'gain': float(line.slope - 1), 'offset_rad': float(line.offset),
-                 'delay_s': float(line.delay), 'heldout_rms_rad': of_line(log, index, last)},
+        'line': {'gain': line[1] - 1, 'offset_rad': line[2], 'delay_s': line[0],
+                 'heldout_rms_rad': of_line(log, index, last)},
         'holds_for': log.first().motion(index),
         'published_rms_rad': error_rms(log, index, file, is_held),
         'fit_rms_rad': predicted(log, index, first),
