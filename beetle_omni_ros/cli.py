@@ -60,7 +60,8 @@ def main(args: list[str] | None = None) -> int:
                 return UNUSABLE
             context = getattr(error, 'ctx', None)
             command = context.command_path if context else 'beetle_omni'
-            return _fail(f'{text} See {command} --help.', UNUSABLE)
+            end = '' if text.endswith(('.', '?')) else '.'
+            return _fail(f'{text}{end} See {command} --help.', UNUSABLE)
         raise
 
 

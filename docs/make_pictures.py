@@ -137,31 +137,6 @@ def own_robot():
                              for name in ('known', 'wrong', 'slow')}, 'Two poses', 2 * POSE)
 
 
-def own_gap():
-    """Error of the model, before and after, and the mass."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        plant = folder / 'secret.yaml'
-        plant.write_text('extends: robot.yaml\neffects: {mass: {mass: 3.3}}\n')
-        for seed in (1, 2):
-            bo.simulate('nmpc', 'random8', plant=plant, seed=seed, bag=folder / f'flight{seed}')
-        found = bo.find_gap([folder / 'flight1'], holdout=[folder / 'flight2'])
-    drawn, (left, right) = figure(2)
-    bars = [found['gap_before'], found['gap_after'], found['noise_floor']]
-    left.bar(['before', 'after', 'noise'], bars, color=[BEFORE, AFTER, FAINT], width=0.6)
-    named(left, 'Gap on the flight that judges', '', 'gap, in units of the noise')
-    mass = found['effects'][0]['parameters']['mass']
-    low, high = mass['interval']
-    right.errorbar([mass['value']], [1], xerr=[[mass['value'] - low], [high - mass['value']]],
-                   fmt='o', color=AFTER, capsize=4, label='found, 95 % interval')
-    right.plot([3.3], [1], 'x', color=INK, markersize=9, label='true')
-    right.plot([3.0386], [1], 's', color=FAINT, label='robot file')
-    right.set(yticks=[], ylim=(0.8, 1.4))
-    right.legend(loc='upper center')
-    named(right, f"named: {', '.join(found['effects'][0]['names'])}", 'mass [kg]', '')
-    return drawn
-
-
 def real_gap():
     """Disagreement and sizes of three real flights, as on the page of `gap`."""
     return picture_of(bo.find_gap(
@@ -219,7 +194,7 @@ PICTURES: dict[str, tuple[Callable, tuple[str, ...]]] = {
     **{f'{TUTORIALS}/{made.__name__}.png': (made, read) for made, read in (
         (first_flight, ()), (own_trajectory, ('docs/tutorials/own_trajectory.md',)),
         (own_controller, ('docs/tutorials/own_controller.md',)),
-        (own_robot, ('docs/tutorials/own_robot.md',)), (own_gap, ()),
+        (own_robot, ('docs/tutorials/own_robot.md',)),
         (real_gap, ('params/crazyflie.yaml', 'test/data/nanobench/*.csv.gz')),
         (hardware_flight, ()))},
     'pictures/flight.gif': (flight, SHIPPED), 'pictures/gap.gif': (gap, SHIPPED),

@@ -33,7 +33,7 @@ FILES = {
     'process.yaml': 'faults: {a: {strike: [{kind: controller_silent, at: 1}]}}\n',
     'device.yaml': 'faults: {a: {strike: [{kind: joints_lost}]}}\n',
     'baud.yaml': share_path('params/servo_bus.yaml').read_text() + '    baud_rate: fast\n',
-    'port.yaml': 'prt: /dev/x\n'}
+    'port.yaml': 'prt: /dev/x\n', 'winds.yaml': 'without: [winds]\n'}
 DB3 = 'old/old_0.db3'
 
 EVALUATE, COMPARE = 'evaluate --task good.csv', \
@@ -123,6 +123,7 @@ CASES = {
     'gap': [
         ('', "'RUN...'"), ('none', 'none: no such bag'), ('imu_only imu_only', 'imu_only'),
         ('imu_only --robot unknown.yaml', 'masss'), ('imu_only --gap unknown.yaml', 'masss'),
+        ('imu_only --gap winds.yaml', "'without': unknown effect; did you mean 'wind'"),
         ('imu_only --apply no/robot.yaml', 'there is no folder'),
         ('imu_only --report folder', 'it is a folder')],
     'identify': [

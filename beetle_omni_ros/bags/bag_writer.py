@@ -155,7 +155,11 @@ class BagWriter(Recorder, AbstractContextManager):
             self._declare(name, entry.type, entry.qos)
         if received is None:
             received = value[0].t if isinstance(value, list) else value.stamp
-        message = entry.write(value)
+        try:
+            message = entry.write(value)
+        except AttributeError:      # of a component of a user
+            raise ParameterError(f"topic '{topic}': expected a {entry.value.__name__}, "
+                                 f'found {type(value).__name__}') from None
         self.write_raw(name, entry.type, to_bytes(message, entry.type), received)
 
     def write_raw(self, topic: str, msgtype: str, data: bytes | memoryview, t: float) -> None:

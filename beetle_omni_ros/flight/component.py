@@ -20,6 +20,7 @@ import numpy as np
 
 from beetle_omni_ros.bags.messages import Diagnostic, MessageError
 from beetle_omni_ros.bags.topics import Qos
+from beetle_omni_ros.control.base import error_text
 from beetle_omni_ros.control.registry import loaded, snake_case
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
@@ -344,7 +345,8 @@ def component_class(reference: str) -> type[Component]:
     """
     kind = loaded(reference, 'component')
     if not (isinstance(kind, type) and issubclass(kind, Component)):
-        raise ParameterError(f"component '{reference}': {kind!r} is no subclass of Component")
+        raise ParameterError(f"component '{reference}': expected a subclass of Component, "
+                             f'found {getattr(kind, "__name__", kind)}')
     return kind
 
 
@@ -354,5 +356,20 @@ def node_name(kind: type[Component]) -> str:
 
 
 def made(references: Iterable[str], robot: RobotParameters) -> list[Component]:
-    """Components of references; their topics are those of the table or registered ones."""
-    return [component_class(reference)(robot) for reference in references]
+    """
+    Components of references; their topics are those of the table or registered ones.
+
+    Raises:
+        ParameterError: see :func:`component_class`, or the constructor raised an exception.
+
+    """
+    components = []
+    for reference in references:
+        try:
+            components.append(component_class(reference)(robot))
+        except ParameterError:
+            raise
+        except Exception as error:
+            raise ParameterError(f"component '{reference}': building it raised "
+                                 f'{error_text(error)}') from error
+    return components

@@ -18,7 +18,7 @@ from typing import Any
 
 from beetle_omni_ros.bags.log import Recorder
 from beetle_omni_ros.bags.topics import ALL, TARGETS
-from beetle_omni_ros.control.base import Controller, PoseTarget, Target
+from beetle_omni_ros.control.base import Controller, error_text, PoseTarget, Target
 from beetle_omni_ros.control.tasks import Task
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight.component import Component, DIAGNOSTICS_PERIOD, Timer
@@ -233,7 +233,7 @@ class FlightLoop(Loop):
                              for name, controller in controllers.items()}
         self._faults = ProcessFaults(self.simulator.tick)
         self.recording: Callable[[], Any] = lambda: None
-        self._given_faults, self.epoch = tuple(faults), epoch
+        self._given_faults, self.epoch, self._others = tuple(faults), epoch, tuple(others)
         self._before, self._crashed = '', False     # state of the supervisor
         super().__init__(
             SimulatedRobot(self.simulator, plant),
@@ -369,8 +369,21 @@ class FlightLoop(Loop):
             self.resume(self._supervision)
 
     def step(self) -> None:
-        """Run one tick of the robot and of every component that is due in it."""
-        super().step()
+        """
+        Run one tick of the robot and of every component that is due in it.
+
+        Raises:
+            ParameterError: one of ``others`` raised an exception.
+
+        """
+        try:
+            super().step()
+        except (ParameterError, RunError):
+            raise
+        except Exception as error:
+            if not self._others:
+                raise
+            raise ParameterError(f'a component raised {error_text(error)}') from error
         state = self.supervisor.state
         if state != self._before:
             self._crashed = self._crashed or (

@@ -21,7 +21,7 @@ from beetle_omni_ros.model.readings import ImuReading, JointReading, PoseReading
 
 PERIOD, LATENCY = 0.005, 0.01   # [s] of the IMU; of a MoCap pose
 MISSED, LONG = 0.001, 0.5       # share of missed cycles that fails; p99 over period that warns
-REMEDY = 'governor, priority, isolated cores: docs/how-to/first_hover.md'
+REMEDY = 'governor, isolated cores: first_hover.md'
 
 
 def check_timing(robot: RobotParameters,

@@ -14,6 +14,7 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight import component as base
+from beetle_omni_ros.flight import evaluate
 from beetle_omni_ros.flight.component import (
     Component,
     component_class,
@@ -335,8 +336,29 @@ def test_an_observer_of_others_estimates_an_external_force_in_the_loop():
 def test_a_class_that_is_no_component_is_refused(tmp_path):
     file = tmp_path / 'own.py'
     file.write_text('class Own:\n    pass\n')
-    with pytest.raises(ParameterError, match='no subclass of Component'):
+    with pytest.raises(ParameterError, match='expected a subclass of Component, found'):
         component_class(f'{file}:Own')
     with pytest.raises(ParameterError, match="^component 'gone.py:Own': no such file"):
         component_class('gone.py:Own')
     assert node_name(component_class(OBSERVER)) == 'wrench_observer_node'
+
+
+@pytest.mark.parametrize('line, error', [
+    ('1 / 0', r'a component raised ZeroDivisionError: division by zero \(own.py:9\)'),
+    ("self.send('battery_state', 1.0)", "topic 'battery_state': expected a Battery.*, found"),
+    ('', r"component '.*own.py:Own': building it raised NameError: .*\(own.py:6\)")])
+def test_a_mistake_in_a_component_is_one_line_with_its_place(tmp_path, line, error):
+    file = tmp_path / 'own.py'
+    file.write_text(f"""from beetle_omni_ros.flight.component import Component
+
+class Own(Component):
+    def __init__(self, robot):
+        super().__init__('own_node')
+        {'' if line else 'nothing'}
+        self.reads('imu/data_raw', self._take)
+    def _take(self, sample):
+        {line or 'pass'}
+""")
+    with pytest.raises(ParameterError, match=error):
+        evaluate.fly('hover', make_task('random1'), robot=ROBOT, plant=ROBOT,
+                     bag=tmp_path / 'bag', components=[f'{file}:Own'])

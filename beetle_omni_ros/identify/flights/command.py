@@ -116,10 +116,13 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
         write_corrected(apply, result, model, robot, tolerances)
     _print(console, result)
     corrected = apply if result['effects'] else None
+    more = '--apply FILE a robot file' if result['effects'] else \
+        '--learn FILE an effect that no entry has' if result['held_out'] and not learn \
+        and 'joints' not in result else '--json FILE all numbers'
     print_end(console, (corrected, written, page, json_path), (
         'evaluate', '--robot', corrected) if corrected
               else 'no robot file, because no effect is named' if apply else
-              'the same with --report FILE writes a page, with --apply FILE a robot file')
+              f'the same with --report FILE writes a page, with {more}')
     return result
 
 

@@ -130,7 +130,7 @@ def _closing(result):
 
 def _chance(result):
     chance = result.get('false_alarm_probability')
-    if chance is None:
+    if chance is None or chance >= 1:   # the evidence of the catalogue is against a gap
         return ''
     size = f'{chance:.1g}' if chance >= LEAST_CHANCE else f'below {LEAST_CHANCE:g}'
     return f'The probability of a false alarm is {size}.'
@@ -291,7 +291,8 @@ def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str
                     'nat).', html(evidence(candidates, len(candidates)))),
             section('Tolerances', 'Deviations of this robot from the robot file, as fitted and '
                     'not named; --tolerances writes masses, gains, lags and rotor positions to '
-                    'the robot file.', html(_tolerances(result)))]
+                    'the robot file.', '<details><summary>All numbers</summary>'
+                    f'{html(_tolerances(result))}</details>')]
     with matplotlib.rc_context(figures.STYLE):
         picture = figures.svg(_damage(*damaged), 'damaged readings') if damaged else figures.svg(
             picture_of(result), 'disagreement and sizes') if result['where'] else ''

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros.model import schema
+from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import parameter, ParameterFile
 
@@ -94,7 +95,12 @@ class GapParameters:
         """
         shipped = share_path('params/gap.yaml')
         values = schema.load_yaml(shipped) | (schema.load_yaml(path) if path else {}) | changed
-        return schema.bind(cls, values, str(path or shipped))
+        loaded: GapParameters = schema.bind(cls, values, str(path or shipped))
+        for name in loaded.without:
+            if name not in CATALOGUE:
+                raise schema.unknown(f"{path or shipped}: key 'without'", 'effect', name,
+                                     sorted(CATALOGUE))
+        return loaded
 
 
 @dataclass(frozen=True, eq=False)
