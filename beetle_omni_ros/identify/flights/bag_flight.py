@@ -245,9 +245,9 @@ class BagFlight:
                             for name, factor in own.items()
                             for key, part in self.starts[name].items()}}
 
-    def restart(self, theta: dict[str, float]) -> dict[str, float]:
+    def restart(self, theta: dict[str, float], part: float) -> dict[str, float]:
         """
-        Move the starts that act in ``theta`` to their fitted values.
+        Move the starts that act in ``theta`` by a ``part`` of the way to their fitted values.
 
         All flights share the starts. Where a start acts, its factor becomes one, and its tangents
         become zero.
@@ -255,7 +255,8 @@ class BagFlight:
         new = {name: 1.0 for name in self.starts if theta.get(name)}
         for tangent, (name, key) in self.tangents.items():
             if name in new:
-                self.starts[name][key] *= max(theta[name] + theta.get(tangent, 0.0), LEAST)
+                self.starts[name][key] *= max(
+                    1 + part * (theta[name] + theta.get(tangent, 0.0) - 1), LEAST)
                 new[tangent] = 0.0
         return new
 

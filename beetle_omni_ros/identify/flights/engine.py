@@ -14,13 +14,15 @@ from beetle_omni_ros.identify.flights.keys import Entry, Prior
 from beetle_omni_ros.identify.flights.spectrum import (
     EDGES,
     pooled,
+    Spectrum,
     spectrum,
     whitening,
 )
 
 FREE = 100.0            # typical deviations that known effects may have while noise is learned,
                         # so that the noise holds nothing that they explain
-ROUNDS = 3              # linearisations
+ROUNDS, MOST_ROUNDS = 3, 6      # linearisations; more than the least until the best set stays
+STEPS = 1.0, 0.5, 0.25, 0.0     # tried parts of a step from a start to fitted values
 FORM = 0.25             # relative error of an entry by its form
 SAME = 0.04             # share of a typical difference between flights by which one value varies
 MOST = 8                # entries of a set
@@ -150,40 +152,100 @@ class Engine:
         self._learn(spectra := self._spectra(theta, etas))
         self.filters = [self._filter(s, s.noise) for s in spectra]
         self.common = self._filter(max(spectra, key=lambda s: s.band[-1]), pooled(spectra))
-        noise: list[np.ndarray] = []
-        for turn in range(ROUNDS):
-            self.progress(f'linearising, {turn + 1}')
-            self._settle(theta, etas)
-            spectra = self._spectra(theta, etas)
-            self.narrow[self.known:] = self.start[self.known:]
-            for each, before in zip(spectra, noise, strict=False):
-                each.noise = before
-            self._learn(spectra, 2 if turn else 5)      # again from the noise before
-            noise = [each.noise for each in spectra]
-            self.progress(f'weighing effects, {turn + 1}')
+        spectra, best, turn = [], None, 0
+        while True:
+            turn += 1
+            self.progress(f'linearising, {turn}')
+            spectra = self._linearised(theta, etas, spectra)
+            self.progress(f'weighing effects, {turn}')
             solution = self._steady(spectra)
-            etas = np.array([solution.equations.of_flight(k, solution.theta)[:len(self.names)]
-                             for k in range(len(spectra))])
-            etas[:, :self.known][:, self.curved] = 0.0
-            theta = self._next(solution)
-            if turn == ROUNDS - 1:
-                break
-            if self.curved.any():
-                starts = self.flights[0].restart(dict(zip(self.names, theta[:self.known],
-                                                          strict=False)))
-                for name, value in starts.items():
-                    theta[self.index[name]] = value
-        solution.plain = self._weighing(spectra, solution.banned, 1e-9 * self.start[self.known:])
+            if turn == MOST_ROUNDS or turn >= ROUNDS and solution.best == best:
+                return self._with_plain(solution)
+            best = solution.best
+            theta, etas = self._next(solution)
+
+    def again(self, solution: Solution, chosen: tuple[int, ...]) -> Solution:
+        """The set ``chosen``, linearised at its own values; nothing is searched."""
+        judge = solution.judge
+        for _ in range(ROUNDS):
+            solution = replace(solution, best=chosen, judge=judge, equations=judge.equations,
+                               posterior=judge.posterior(self.indices(chosen)))
+            theta, etas = self._next(solution)
+            solution.spectra = self._linearised(theta, etas, solution.spectra)
+            judge = self._weighing(solution.spectra, solution.banned, self.narrow[self.known:])
+        return self._with_plain(replace(
+            solution, judge=judge, equations=judge.equations,
+            posterior=judge.posterior(self.indices(chosen))))
+
+    def _linearised(self, theta, etas, before):
+        """Spectra at a point; their noise begins at that of the spectra ``before``, if any."""
+        self._settle(theta, etas)
+        self.acting = self.curved & (theta[:self.known] == 1)
+        spectra = self._spectra(theta, etas)
+        self.narrow[self.known:] = self.start[self.known:]
+        for each, last in zip(spectra, before, strict=False):
+            each.noise = last.noise
+        self._learn(spectra, 2 if before else 5)
+        return spectra
+
+    def _with_plain(self, solution):
+        solution.plain = self._weighing(solution.spectra, solution.banned,
+                                        1e-9 * self.start[self.known:])
         return solution
 
     def _next(self, solution):
-        """(K,) point of the next linearisation: no starts but those of the best set."""
+        """Point of the next linearisation, common and of flights: starts of the best set only."""
+        etas = np.array([solution.equations.of_flight(k, solution.theta)[:len(self.names)]
+                         for k in range(len(self.flights))])
+        etas[:, :self.known][:, self.curved] = 0.0
         theta = np.zeros(len(self.names))
         theta[:self.known] = solution.theta[:self.known]
         theta[:self.known][self.curved] = 0.0
         own = self.indices(solution.best)
         theta[own] = solution.theta[own]
+        return self._restarted(theta, etas, solution.spectra), etas
+
+    def _restarted(self, theta, etas, spectra):
+        """
+        The point ``theta``, with starts moved to their fitted values.
+
+        A secant is valid up to its start. Of some parts of the step from it, that one is made
+        which leaves least of the flights.
+        """
+        if not theta[:self.known][self.curved].any():
+            return theta
+        starts, points = self.flights[0].starts, []
+        fitted = dict(zip(self.names, theta[:self.known], strict=False))
+        before = {name: dict(start) for name, start in starts.items()}
+        for part in STEPS:
+            starts.update({name: dict(start) for name, start in before.items()})
+            at = theta.copy()
+            for name, value in self.flights[0].restart(fitted, part).items():
+                at[self.index[name]] = value
+            left = sum(self._left(k, at + eta, found) for k, (eta, found) in enumerate(
+                zip(etas, spectra, strict=True)))
+            points.append((left, at, {name: dict(start) for name, start in starts.items()}))
+        _, theta, moved = min(points, key=lambda point: point[0])
+        starts.update(moved)
+        self._last.clear()      # was made at the starts before
         return theta
+
+    def _left(self, k, theta, found):
+        """Whitened power of flight k at ``theta`` (K,), with the noise that was ``found``."""
+        values = dict(zip(self.names, self._at(k, theta), strict=False))
+        rest = self.transformed(k, self.flights[k].linear(values, []).residual)
+        rest.noise = found.noise
+        return rest.power()
+
+    def transformed(self, k: int, series: np.ndarray) -> Spectrum:
+        """Coefficients of a series (N, C) as those of the residual of flight k."""
+        return self._spectrum(self.flights[k], series, np.zeros((*series.shape, 0)),
+                              self.filters[k])
+
+    def _spectrum(self, flight, residual, slopes, filters):
+        floor = np.array([FLOORS[c.split('_')[0]] for c in flight.channels])
+        return spectrum(residual, slopes, flight.mask, flight.period, floor, flight.highest,
+                        self.groups, filters)
 
     def _steady(self, spectra):
         """
@@ -220,10 +282,7 @@ class Engine:
             for column, (key, rows) in self.late.items():
                 slopes[:, rows, column] = linear.slopes[:, rows, key]
             slopes[:, :, self.known:] = -phi.reshape(*residual.shape, -1)
-            floor = np.array([FLOORS[c.split('_')[0]] for c in flight.channels])
-            found = spectrum(residual, slopes, flight.mask, flight.period, floor,
-                             flight.highest, self.groups, own)
-            spectra.append(found)
+            spectra.append(self._spectrum(flight, residual, slopes, own))
         return spectra
 
     def others(self, flights: Sequence, theta: np.ndarray) -> tuple[list, bool]:
@@ -388,4 +447,5 @@ class Engine:
                      np.concatenate([self.bounds, np.tile([-np.inf, np.inf], (more, 1))]),
                      np.concatenate([self.kept, flat]),
                      np.concatenate([self.owner, np.full(more, len(self.entries))]),
-                     self.alpha / len(self.entries), np.concatenate([self.far, flat]))
+                     self.alpha / len(self.entries), np.concatenate([self.far, flat]),
+                     np.concatenate([self.acting, flat]))

@@ -27,6 +27,7 @@ from beetle_omni_ros.identify.flights.spectrum import Spectrum
 from beetle_omni_ros.identify.inference.noise import few_blocks
 
 NONE = np.zeros(0, dtype=int)
+EXACT = 1e-3            # deviation of a factor that is one
 
 
 @dataclass(eq=False)
@@ -178,12 +179,14 @@ class Judge:
         owner: (K,) index of the entry of each key.
         level: probability at which the widening by few blocks holds.
         far: (K,) keys whose deviation may be much larger than typical; not those of sensors.
+        acting: (K,) factors of effects that act at the point of linearisation. A set that has
+            such an effect has it as linearised, with a factor of one.
 
     """
 
     def __init__(self, equations: Normal, narrow: np.ndarray, typical: np.ndarray,
                  bounds: np.ndarray, kept: np.ndarray, owner: np.ndarray, level: float,
-                 far: np.ndarray):
+                 far: np.ndarray, acting: np.ndarray):
         self.equations, self.narrow, self.typical = equations, narrow, typical
         self.bounds, self.kept = bounds.tolist(), kept
         self.bounded = np.isfinite(bounds).any(axis=1)
@@ -191,7 +194,7 @@ class Judge:
         self.covariance = np.linalg.inv(equations.info + np.diag(narrow**-2))
         self.mean = self.covariance @ equations.right
         self.blocks = len(equations.scores)
-        self.owner, self.far = owner, far
+        self.owner, self.far, self.acting = owner, far, acting
         self.student = few_blocks(level, self.blocks)
         self._kept: dict[tuple[int, ...], Posterior] = {}
         self._profiles: dict[tuple[int, ...], tuple] = {}
@@ -257,8 +260,9 @@ class Judge:
         info = vectors @ np.diag(np.maximum(values, 1e-9 * self.narrow[c].min()**-2)) @ vectors.T
         score = own @ self.mean[c]
         estimate = np.linalg.solve(info, score)
-        slab = np.hypot(self.narrow[c], self._scales(c, estimate) * self.typical[c])
-        fitted = np.linalg.solve(info + np.diag(slab**-2), score)
+        slab = np.where(self.acting[c], EXACT, np.hypot(
+            self.narrow[c], self._scales(c, estimate) * self.typical[c]))
+        fitted = np.linalg.solve(info + np.diag(slab**-2), score + self.acting[c] * slab**-2)
         theta = self.mean + direction @ (fitted - self.mean[c])
         wide = self.widened(direction, info, theta)
         self._profiles[index] = c, estimate, wide, direction, slab
@@ -301,13 +305,15 @@ class Judge:
         """
         Ln of the density of an estimate, and mean and covariance of its keys within their bounds.
 
-        The priors are normal and end at the bounds. The bounds of one key after the other cut the
+        The priors are normal about zero, or about one for the factor of an effect that acts, and
+        end at the bounds. The bounds of one key after the other cut the
         posterior, which stays normal with the mean and the covariance of what remains. The upper
         limit of a tolerance does not hold for a candidate. The lower one is physical.
         """
         if not len(c):
             return 0.0, estimate, wide
-        variance = prior**2
+        variance, centre = prior**2, free * self.acting[c]
+        estimate = estimate - centre
         both = wide + np.diag(variance)
         inverse = np.linalg.inv(both)
         # the normal density of an estimate with the covariance of noise and prior
@@ -315,7 +321,7 @@ class Judge:
         share = variance[:, None] * inverse
         total, mean = np.diag(variance) - share * variance, share @ estimate
         for k in np.flatnonzero(self.bounded[c]):
-            (low, high), size = self.bounds[c[k]], float(prior[k])
+            (low, high), size = np.subtract(self.bounds[c[k]], centre[k]), float(prior[k])
             high = inf if free[k] and self.kept[c[k]] else high
             deviation, middle = sqrt(total[k, k]), float(mean[k])
             chance, shift, left = _within((low - middle) / deviation, (high - middle) / deviation)
@@ -323,7 +329,7 @@ class Judge:
             change = total[:, k] / total[k, k]
             mean = mean + change * (shift * deviation)
             total = total - change[:, None] * (total[k] * (1 - left))
-        return value, mean, total
+        return value, mean + centre, total
 
 
 @lru_cache(100_000)      # the same priors end at the same bounds in most sets

@@ -57,9 +57,7 @@ def explained(engine: Engine, solution: Solution, group: str) -> float:
         x = fitted(engine, solution, k)
         # a fit of feedback makes the robot heavier; the inertia is that of the file
         x[[k for k, name in enumerate(engine.names) if name.startswith('inertia.')]] = 0.0
-        measured = spectrum(flight.linear({}, []).measured, np.zeros((*flight.mask.shape, 0)),
-                            flight.mask, flight.period, found.floor, flight.highest,
-                            engine.groups, engine.filters[k])
+        measured = engine.transformed(k, flight.linear({}, []).measured)
         moving = found.band > 0
         moving[found.counts[0]:] = False
         rest, all_of_it = ((x / noise_of(found))[:, moving][:, :, own] for x in (

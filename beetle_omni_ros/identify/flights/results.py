@@ -211,9 +211,9 @@ def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Poster
             spans.append([max(key.value(middle - half), min(spec.low, values[-1])),
                           min(key.value(middle + half), max(spec.high, values[-1]))])
         if own:
-            base, key = [keys[name].base for name in own], keys[own[0]]
-            one, row = len(own) == 1, np.abs(rows[own[0]])
-            typical = float((row * engine.typical[index]).max())
+            base, key, one = [keys[name].base for name in own], keys[own[0]], len(own) == 1
+            typical = float(engine.typical[engine.index[own[0]]]) if own[0] in engine.index \
+                else key.typical
             found[parameter] = {'value': values[0] if one else values, 'unit': spec.unit,
                                 'interval': spans[0] if one else spans,
                                 'file': base[0] if one else base,

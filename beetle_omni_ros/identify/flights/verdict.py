@@ -79,8 +79,9 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     priors, entries, bounds, far = _priors(robot, {
         n: key for n, key in keys.items() if key.effect in CATALOGUE and not key.form
         and key.effect not in {*LIMITS, *p.without}}, tolerance)
-    priors |= {n: Prior(tolerance[n], key.typical, 0.0) for n, key in extra_keys().items()
-                if n != 'modules.share' or robot.multibody is not None}
+    priors |= {n: Prior(tolerance[n], key.typical, 0.0) for n, key in keys.items()
+               if n in tolerance and n not in priors and key.effect not in p.without
+               and (n != 'modules.share' or robot.multibody is not None)}
     for start, own in starts.items():
         name, moved = start.partition('@')[0], [f'{start}~{key}' for key in own]
         priors[start] = Prior(0.03, 1.0, 0.0)
