@@ -86,7 +86,6 @@ class BagFlight:
         self.trusted = self._trusted()
         first, count = self._starts[0], self._length * len(self._starts)
         self.rows = first + THIN * np.arange(count // THIN)
-        self._readings = low_pass(p.smooth_imu, 1, p.grid)
         self._fine = low_pass(WIDEST, 1, p.grid)
         self._poses = low_pass(POSES, 1, p.grid)
         self.mask = np.ones((len(self.rows), len(self.channels)), dtype=bool)
@@ -116,14 +115,12 @@ class BagFlight:
     def _inputs(self, theta):
         """Inputs of the body equations, name -> (M, width)."""
         s = self.signals
-        thrust, thrust_rate = s.thrust(theta)
+        thrust, thrust_rate = s.smooth_thrust(theta)
         position, quaternion, velocity = s.pose(theta)
         tilt, tilt_rate, tilt_acceleration, _ = s.joints(theta)
         inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': s.imu(theta)[1],
                   'tilt': tilt, 'tilt_rate': tilt_rate, 'tilt_acceleration': tilt_acceleration,
-                  # as the readings are smoothed that the forces are compared with
-                  'thrust': within(self._readings, thrust, 0),
-                  'thrust_rate': within(self._readings, thrust_rate, 0), 'position': position,
+                  'thrust': thrust, 'thrust_rate': thrust_rate, 'position': position,
                   'voltage': s.voltage, 'charge': s.charge,
                   'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0))}
         return {name: values[self.rows] for name, values in inputs.items()}

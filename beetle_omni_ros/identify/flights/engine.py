@@ -69,6 +69,7 @@ class Engine:
         self._generic()
         self.filters: list = [None] * len(self.flights)     # (C, L) of each flight
         self._last: dict = {}       # flight -> point and linear model
+        self._phi: dict = {}        # flight -> its filters, and spectrum of the discrepancy
         kinds = [c.split('_')[0] for c in self.channels]
         kinds = ['body' if kind in ('force', 'torque') else kind for kind in kinds]
         self.groups = [np.array([k for k, own in enumerate(kinds) if own == kind])
@@ -267,22 +268,22 @@ class Engine:
 
     def _spectra(self, theta, etas, fitted=True):
         """Spectra of the flights; the keys of each flight are those of the ``fitted`` ones."""
-        spectra = []
+        spectra, every = [], list(range(len(self.channels)))
         for k, (flight, eta, phi, own) in enumerate(zip(
                 self.flights, etas, self.generic, self.filters, strict=True)):
             at = self._at(k if fitted else -1, theta + eta)
             linear = self._linear(flight, at)
+            shape = linear.residual.shape
+            if self._phi.get(flight, (None,))[0] is not own or own is None:
+                self._phi[flight] = own, self._spectrum(
+                    flight, np.zeros(shape), -phi.reshape(*shape, -1), own)
             # linear about the robot file
-            residual = linear.residual - linear.slopes @ at
-            slopes = np.zeros((len(self.names), *residual.T.shape)).T     # times are contiguous
-            slopes[:, :, :self.real] = linear.slopes
-            for at_flight, key, column in self.repeats:
-                if fitted and at_flight == k:
-                    slopes[:, :, column] = linear.slopes[:, :, key]
-            for column, (key, rows) in self.late.items():
-                slopes[:, rows, column] = linear.slopes[:, rows, key]
-            slopes[:, :, self.known:] = -phi.reshape(*residual.shape, -1)
-            spectra.append(self._spectrum(flight, residual, slopes, own))
+            found = self._spectrum(
+                flight, linear.residual - linear.slopes @ at, linear.slopes, own)
+            spectra.append(found.joined([(column, key, rows) for at_flight, column, key, rows in (
+                *((f, c, key, every) for f, key, c in self.repeats if fitted),
+                *((k, c, key, rows) for c, (key, rows) in self.late.items()))
+                if at_flight == k], self._phi[flight][1], self.known))
         return spectra
 
     def others(self, flights: Sequence, theta: np.ndarray) -> tuple[list, bool]:

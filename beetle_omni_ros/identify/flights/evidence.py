@@ -23,10 +23,9 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from beetle_omni_ros.identify.flights.keys import Entry
-from beetle_omni_ros.identify.flights.spectrum import Spectrum
+from beetle_omni_ros.identify.flights.spectrum import NONE, Spectrum
 from beetle_omni_ros.identify.inference.noise import few_blocks
 
-NONE = np.zeros(0, dtype=int)
 EXACT = 1e-3            # deviation of a factor that is one
 
 
@@ -96,16 +95,16 @@ def normal(spectra: Sequence[Spectrum], names: list[str], flight: np.ndarray,
     info, right, noise = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
     scores, slopes, flights = [], [], []
     for each in spectra:
-        g, h = each.grams()
+        g, h = each.grams(groups if len(split) else NONE)
         gs, hs = np.zeros((len(g), size, size)), np.zeros((len(g), size))
         gs[:, :count, :count], hs[:, :count] = g.sum(axis=1), h.sum(axis=1)
-        for group in range(copies):
-            part = g[:, groups == group].sum(axis=1)
+        for group in range(copies if len(split) else 0):
+            part = g[:, group]
             at = count + group * len(split) + np.arange(len(split))
             gs[:, :count, at] = part[:, :, split]
             gs[:, at, :count] = part[:, split]
             gs[:, at[:, None], at] = part[:, split][:, :, split]
-            hs[:, at] = h[:, groups == group].sum(axis=1)[:, split]
+            hs[:, at] = h[:, group][:, split]
         ge, gee, he = gs[:, own], gs[:, own][:, :, own], hs[:, own]
         inner = np.linalg.inv(gee.sum(axis=0) + np.diag(flight[own]**-2))
         left, right_e = ge.sum(axis=0), he.sum(axis=0)

@@ -61,7 +61,7 @@ def explained(engine: Engine, solution: Solution, group: str) -> float:
         moving = found.band > 0
         moving[found.counts[0]:] = False
         rest, all_of_it = ((x / noise_of(found))[:, moving][:, :, own] for x in (
-            found.residual + found.slopes @ x, measured.residual))
+            found.at(x), measured.residual))
         left, total = left + (rest**2).sum(), total + (all_of_it**2).sum()
     return 1 - left / total
 
@@ -166,16 +166,18 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
     every = [features_of(flight.motion, flight.time, quick=True) for flight in flights]
     mean = np.concatenate(every).mean(axis=0)
     info, score = [], []
-    own = spectra[0].groups[0]
+    own = spectra[0].parts[0][0]
     for flight, found, rest, kernels, x in zip(flights, spectra, left, filters, every,
                                                strict=True):
         effect = acting(flight.robot, flight.motion, x - mean, channels)
         effect = effect.reshape(len(x), len(channels), -1)
         small = spectrum(np.zeros(effect.shape[:2]), effect, flight.mask, flight.period,
-                         found.floor, flight.highest, spectra[0].groups, kernels)
+                         found.floor, flight.highest, [own], kernels)
         count = found.counts[0]
         root = np.linalg.inv(np.linalg.cholesky(found.noise[-1][np.ix_(own, own)]))
-        a = (root @ small.slopes[:, :count][:, :, own]).reshape(len(rest), -1, effect.shape[2])
+        a = np.zeros((*small.residual.shape[:2], len(own), effect.shape[2]))
+        a[..., small.parts[0][1]] = small.parts[0][2]
+        a = (root @ a[:, :count]).reshape(len(rest), -1, effect.shape[2])
         b = (rest[:, :count][..., own] @ root.T).reshape(len(rest), -1)
         info.append(a.transpose(0, 2, 1) @ a)
         score.append((a.transpose(0, 2, 1) @ b[..., None])[..., 0])
@@ -205,7 +207,7 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
         channels: names of all channels.
 
     """
-    own = spectra[0].groups[0]
+    own = spectra[0].parts[0][0]
     # blocks of flights differ in length, and so do their frequencies
     step = max(found.step for found in spectra)
     last = min((rest.shape[1] - 1) * found.step
@@ -237,7 +239,7 @@ def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
     """
     if solution.banned:
         return []
-    left = [found.residual + found.slopes @ fitted(engine, solution, k)
+    left = [found.at(fitted(engine, solution, k))
             for k, found in enumerate(solution.spectra)]
     rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
             line(solution.spectra, left, engine.channels)]

@@ -276,7 +276,7 @@ def where_of(engine: Engine, solution: Solution) -> list[dict]:
     for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
         x = fitted(engine, solution, k)
         whitened.append([(rest / noise_of(found)).reshape(-1, len(engine.channels))
-                         for rest in (found.residual, found.residual + found.slopes @ x)])
+                         for rest in (found.residual, found.at(x))])
         raw.append([np.where(flight.mask, flight.linear(at, []).residual, np.nan)
                     for at in ({}, dict(zip(engine.names[:known], x, strict=False)))])
     excess, rms = (np.sqrt([np.nanmean(np.concatenate(parts)**2, axis=0)
