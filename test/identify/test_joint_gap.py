@@ -139,7 +139,7 @@ def test_a_corrected_log_has_no_gap():
     result = judged(log, SHIPPED, apart)
     assert result['verdict'] in ('named', 'named_set') and result['gap_before'] > 10
     for effect in result['effects']:
-        assert effect['evidence']['delta_bic'] > 0 and effect['evidence']['cv_gain'] > 0
+        assert effect['evidence']['ln_bayes_factor'] > 0 and effect['evidence']['cv_gain'] > 0
     again = judged(log, corrected(SHIPPED, result), apart)
     assert again['verdict'] == 'no_gap' and again['gap_before'] < 1.2
 

@@ -164,7 +164,8 @@ class BagFlight:
         ends = {name: self._ends(name, theta, own) for name in names if name in self.starts}
         # the servos of all at once; none of them changes a sensor
         sets = list({frozenset(each.items()): each for each in (
-            theta, *(end for both in ends.values() for end in both))}.items())
+            theta, *(end for name, both in ends.items() for end in both
+                     if 'J' in self._groups_of(name)))}.items())
         runs = self._servos([each for _, each in sets], theta)
         self._runs = dict(zip((key for key, _ in sets), runs, strict=True))
         now = self.residual(theta)
@@ -180,7 +181,7 @@ class BagFlight:
         of_keys = self._slopes(theta, now, keys)
         for k, name in enumerate(names):
             if name in self.starts:
-                groups = ''.join({g for key in self.starts[name] for g in self.keys[key].groups})
+                groups = self._groups_of(name)
                 behind, ahead = (now if end == theta else self.residual(end, groups)
                                  for end in ends[name])
                 for group in groups:
@@ -191,6 +192,9 @@ class BagFlight:
                 slopes[:, :, k] = part * of_keys[:, :, keys.index(key)]
         self._runs = {}
         return Linear(residual, slopes, residual)
+
+    def _groups_of(self, start):
+        return self.keys[next(iter(self.starts[start]))].groups
 
     def _slopes(self, theta, now, names):
         """(M, 16, K) derivatives by keys at ``theta``, where the residual is ``now``."""

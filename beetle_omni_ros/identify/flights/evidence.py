@@ -26,6 +26,8 @@ from beetle_omni_ros.identify.flights.keys import Entry
 from beetle_omni_ros.identify.flights.spectrum import NONE, Spectrum
 from beetle_omni_ros.identify.inference.noise import few_blocks
 
+SCALES = 1.0, 3.0, 9.0  # times typical: the prior of a candidate is a mixture of these
+MIXED = log(len(SCALES))    # its price
 EXACT = 1e-3            # deviation of a factor that is one
 
 
@@ -225,24 +227,18 @@ class Judge:
         for chosen, sign in ((one, 1.0), (other, -1.0)):
             free = _among(c, chosen)
             prior = np.where(free, slab, self.narrow[c])
-            total += sign * (self._bounded(c, estimate, wide, prior, free)[0] - log(3) * len(
+            total += sign * (self._bounded(c, estimate, wide, prior, free)[0] - MIXED * len(
                 np.unique(self.owner[c[free & self.far[c]]])))
         return float(total)
 
-    def expected(self, index: list[int]) -> float:
-        """
-        Mean ln of the evidence that keys would have, if they had their typical size [nat].
-
-        With the covariance C of the estimate, and the variances N of the narrow and S of the wide
-        prior, the estimate would scatter by C + S about the robot file, so that the mean of its
-        log density ratio is the divergence of both normal densities.
-        """
+    def least(self, index: list[int], evidence: float) -> float:
+        """Typical sizes of some keys that have this mean ``evidence``; see :func:`least_size`."""
         c, _, wide, _, _ = self._profile(tuple(sorted(index)))
         free = _among(c, index)
-        null = wide + np.diag(self.narrow[c]**2)
-        ratio = np.linalg.solve(null, null + np.diag(free * self.typical[c]**2))
-        return float(0.5 * (np.trace(ratio) - len(c) - np.linalg.slogdet(ratio)[1])
-                     - log(3) * self.far[c[free]].any())
+        far = bool(self.far[c[free]].any())
+        ratio = np.linalg.solve(wide + np.diag(self.narrow[c]**2), np.diag(
+            free * self.typical[c]**2))
+        return least_size(ratio, evidence + MIXED * far, SCALES if far else SCALES[:1])
 
     def _profile(self, index):
         """Keys, estimate and its covariance, change of all keys by them, prior deviations."""
@@ -280,7 +276,7 @@ class Judge:
             own = self.owner[c] == owner
             if self.far[c][own].all():
                 group[own] = np.searchsorted((1.5, 4.5), ratio[own].max())
-        return 3.0**group
+        return np.array(SCALES)[group]
 
     def widened(self, direction, info, theta):
         """
@@ -397,6 +393,25 @@ class Solution:
             effect = not all(self.entries[k].varying for k in chosen)
             parts[effect].append(log_prior(len(chosen), len(self.entries)) + gain)
         return float(np.logaddexp.reduce(parts[True]) - np.logaddexp.reduce(parts[False]))
+
+
+def least_size(ratio: np.ndarray, evidence: float, scales: Sequence[float]) -> float:
+    """
+    Typical sizes from which an effect has the mean ``evidence`` [nat].
+
+    Args:
+        ratio: (d, d) variance of its typical size, over that of an estimate without it, N.
+        evidence: ln of densities with the variances N (1 + scale^2 ratio) and N.
+        scales: of the wide prior; the best one counts.
+
+    """
+    own = np.linalg.eigvals(ratio).real
+    sizes = []
+    for wide in [scale**2 * own for scale in scales]:
+        share = wide / (1 + wide)
+        sizes.append((2 * evidence + (np.log1p(wide) - share).sum())
+                     / max((own * share).sum(), 1e-12))
+    return sqrt(min(sizes))
 
 
 def log_prior(size: int, count: int) -> float:

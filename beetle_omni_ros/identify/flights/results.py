@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import compress
 from math import exp, log
 
 import numpy as np
@@ -13,7 +14,7 @@ from beetle_omni_ros.identify.flights.balance import Balance
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import log_prior, Posterior, Solution
 from beetle_omni_ros.identify.flights.keys import Entry, Key
-from beetle_omni_ros.identify.flights.page import summary
+from beetle_omni_ros.identify.flights.page import size_seen, summary, visible
 from beetle_omni_ros.identify.flights.quality import (
     discrepancy_sizes,
     errors,
@@ -97,23 +98,27 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
     chance = exp(min(0.0, -e_value))
     found = [(e, s, own, k, members) for e, s, own in tests if chance <= alpha
              for k, members in named_of(e, s, alpha)]
+    effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]
+    weak = [effect for effect, (e, *_) in zip(effects, found, strict=True) if e is slow]
+    keep = [one[0] is slow or not of_a_rotor(effect, weak)
+            for one, effect in zip(found, effects, strict=True)]
+    found, effects = list(compress(found, keep)), list(compress(effects, keep))
     taken = [[k for e, _, _, k, _ in found if e is test[0]] for test in tests]
     sets = [list(dict.fromkeys(s.entries[j].label if e is slow else s.entries[j].name
                                for j in members)) for e, s, _, _, members in found]
-    rows = [candidates_of(s, own) for (_, s, _), own in zip(tests, taken, strict=True)]
+    rows = [row for (e, s, own), named in zip(tests, taken, strict=True) for row in candidates_of(
+        e, s, own, named, starts or {}, alpha / len(tests))]
     rest = unexplained(engine, solution) if measured else []
     fed_back = sorted(solution.entries[k].name.replace('_', ' ') for k in solution.banned)
     verdict, reason = verdict_of(chance, sets, rest, fed_back, alpha)
-    effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]
     return result_of(
         verdict, groups, reason,
         effects=[effect for effect, members in zip(effects, sets, strict=True)
                  if verdict in NAMING and len(members) < CROWD],
         partial=[effect for effect, members in zip(effects, sets, strict=True)
                  if verdict not in NAMING or len(members) >= CROWD],
-        candidates=sorted((row for own in rows for row in own), key=_rank, reverse=True),
-        hidden=[name for (_, s, _), own in zip(tests, rows, strict=True)
-                for name in hidden_of(own, len(s.entries), alpha / len(tests))],
+        candidates=sorted(rows, key=_rank, reverse=True),
+        hidden=[row['name'] for row in visible(rows) if size_seen(row) > 1],
         where=where_of(engine, solution), false_alarm_probability=chance,
         held_out=held_out, findings=[*findings, *varied(engine, solution), *(
             test.sentence[:1].upper() + test.sentence[1:] for test in rest
@@ -162,12 +167,29 @@ def effect_of(solution: Solution, engine: Engine, keys: dict[str, Key], k: int,
         'names': list(dict.fromkeys(solution.entries[j].name for j in members)),
         'members': list(dict.fromkeys(solution.entries[j].label for j in members)),
         'parameters': sizes(k), 'layer': CATALOGUE[entry.name].layer, **member_of(entry),
-        'evidence': {'ln_bayes_factor': gain, 'delta_bic': 2 * gain,
-                     'constancy': -solution.unsteady.get(k, 0.0)}}
+        'evidence': {'ln_bayes_factor': gain}}
     if rivals := [{'name': solution.entries[j].name, **member_of(solution.entries[j]),
                    'parameters': sizes(j)} for j in members[1:]]:
         result['rivals'] = rivals
     return result
+
+
+def of_a_rotor(effect: dict, slow: list[dict]) -> bool:
+    """
+    Whether the forces show all rotors as weak because one is.
+
+    Args:
+        effect: named by the forces.
+        slow: effects that the balance of torques names.
+
+    """
+    thrust, = [one['parameters']['scale'] for one in [effect, *effect.get('rivals', [])]
+               if 'thrust_coefficient' in (one.get('name'), one.get('names', [''])[0])] or [None]
+    rotors = [one['parameters']['scale'] for each in slow for one in [
+        each, *each.get('rivals', [])] if 'rotor' in one]
+    return thrust is not None and any(
+        thrust['interval'][0] <= thrust['file'] * (3 + rotor['value'] / rotor['file']) / 4
+        <= thrust['interval'][1] for rotor in rotors)
 
 
 def member_of(entry: Entry) -> dict[str, int]:
@@ -221,28 +243,31 @@ def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Poster
     return found
 
 
-def candidates_of(solution: Solution, taken: Sequence[int]) -> list[dict]:
+def candidates_of(engine: Engine, solution: Solution, keys: dict[str, Key], taken: Sequence[int],
+                  starts: Starts, alpha: float) -> list[dict]:
     """
-    Evidence of each entry alone, the largest first.
+    Evidence of each entry alone.
 
-    Of the starts of one entry, the one with most evidence counts. ``expected_ln_bayes_factor`` is
-    the evidence that a typical size would have in these flights.
+    Of the starts of one entry, the one with most evidence counts. ``seen_from`` is the size that
+    would be named in the mean; of several starts, the smallest one.
     """
+    count = len(solution.entries)
+    least = log(1 / alpha) + log_prior(0, count) - log_prior(1, count)
     rows: dict[tuple, dict] = {}
     for k, entry in enumerate(solution.entries):
         if entry.varying:
             continue
         gain = solution.gains.get((k,))
-        index = [solution.names.index(key) for key in entry.keys]
         row = {'name': entry.name, **member_of(entry), 'accepted': k in taken,
                'reason': 'value differs between frequencies' if k in solution.banned else '',
-               'evidence': {'ln_bayes_factor': gain,
-                            'delta_bic': None if gain is None else 2 * gain},
-               'expected_ln_bayes_factor': solution.judge.expected(index)}
+               'evidence': {'ln_bayes_factor': gain},
+               'seen_from': seen_from(engine, solution, keys, entry, starts, least)}
         other = rows.get((entry.name, entry.member))
-        if other is None or _rank(row) > _rank(other):
-            rows[entry.name, entry.member] = row
-    return sorted(rows.values(), key=_rank, reverse=True)
+        if other:
+            row = max(other, row, key=_rank) | {
+                'seen_from': min(other, row, key=size_seen)['seen_from']}
+        rows[entry.name, entry.member] = row
+    return list(rows.values())
 
 
 def _rank(row):
@@ -250,17 +275,29 @@ def _rank(row):
     return row['accepted'], -np.inf if gain is None else gain
 
 
-def hidden_of(rows: list[dict], count: int, alpha: float) -> list[str]:
+def seen_from(engine: Engine, solution: Solution, keys: dict[str, Key], entry: Entry,
+              starts: Starts, evidence: float) -> dict:
     """
-    Entries that would not be named at their typical size: their mean evidence is too small.
+    Size of an entry's first number with this mean ``evidence``, its typical size, and the unit.
 
-    ``rows``: of :func:`candidates_of`; ``count``: number of entries.
+    The unit is % for a share of the robot file. A secant is not valid beyond its start, so that
+    a larger size is None.
     """
-    best: dict[str, float] = {}
-    for row in sorted(rows, key=lambda row: _rank(row)[1], reverse=True):
-        best[row['name']] = max(best.get(row['name'], -np.inf), row['expected_ln_bayes_factor'])
-    least = log(1 / alpha) + log_prior(0, count) - log_prior(1, count)
-    return [name for name, evidence in best.items() if evidence < least]
+    name, unit = entry.keys[0], '%'
+    size = solution.judge.least([engine.index[key] for key in entry.keys], evidence)
+    if name in starts:
+        own, part = next(iter(starts[name].items()))
+        sizes = [size * abs(part) if size <= 1 else np.inf, keys[own].typical]
+    else:
+        own, typical = name, float(engine.typical[engine.index[name]])
+        sizes = [size * typical, typical]
+    if keys[own].relative:      # a limit is lower
+        sizes = [-100 * float(np.expm1(-x)) if name in starts else 100 * float(np.expm1(x))
+                 for x in sizes]
+    else:
+        unit = CATALOGUE[entry.name].parameters[keys[own].parameter].unit
+    return {'value': sizes[0] if size <= 1 or name not in starts else None, 'typical': sizes[1],
+            'unit': unit}
 
 
 def where_of(engine: Engine, solution: Solution) -> list[dict]:
