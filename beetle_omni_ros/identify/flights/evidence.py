@@ -16,15 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
-from math import comb, exp, inf, log, log1p, pi, sqrt
+from math import comb, inf, log, pi, sqrt
 
 import numpy as np
-from scipy.special import log_ndtr
 
 from beetle_omni_ros.identify.flights.keys import Entry
 from beetle_omni_ros.identify.flights.spectrum import NONE, Spectrum
-from beetle_omni_ros.identify.inference.noise import few_blocks
+from beetle_omni_ros.identify.inference.noise import few_blocks, within_limits
 
 SCALES = 1.0, 3.0, 9.0  # times typical: the prior of a candidate is a mixture of these
 MIXED = log(len(SCALES))    # its price
@@ -319,30 +317,13 @@ class Judge:
             (low, high), size = np.subtract(self.bounds[c[k]], centre[k]), float(prior[k])
             high = inf if free[k] and self.kept[c[k]] else high
             deviation, middle = sqrt(total[k, k]), float(mean[k])
-            chance, shift, left = _within((low - middle) / deviation, (high - middle) / deviation)
-            value += chance - _within(low / size, high / size)[0]
+            chance, shift, left = within_limits(
+                (low - middle) / deviation, (high - middle) / deviation)
+            value += chance - within_limits(low / size, high / size)[0]
             change = total[:, k] / total[k, k]
             mean = mean + change * (shift * deviation)
             total = total - change[:, None] * (total[k] * (1 - left))
         return value, mean + centre, total
-
-
-@lru_cache(100_000)      # the same priors end at the same bounds in most sets
-def _within(low: float, high: float) -> tuple[float, float, float]:
-    """Ln of the probability that a standard normal is between limits; its mean, variance there."""
-    if low + high > 0:
-        chance, mean, variance = _within(-high, -low)
-        return chance, -mean, variance
-    upper = float(log_ndtr(high))
-    less = float(log_ndtr(low)) - upper if low > -inf else -inf
-    chance = upper + log1p(-exp(min(less, -1e-12)))
-    mean = edge = 0.0
-    for sign, x in ((1, low), (-1, high)):
-        if abs(x) < inf:
-            density = sign * exp(-0.5 * x * x - 0.5 * log(2 * pi) - chance)
-            mean += density
-            edge += x * density
-    return chance, mean, min(max(1 + edge - mean * mean, 1e-6), 1.0)
 
 
 def _among(keys, chosen):

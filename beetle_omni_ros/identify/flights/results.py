@@ -16,12 +16,10 @@ from beetle_omni_ros.identify.flights.evidence import log_prior, Posterior, Solu
 from beetle_omni_ros.identify.flights.keys import Entry, Key
 from beetle_omni_ros.identify.flights.page import size_seen, summary, visible
 from beetle_omni_ros.identify.flights.quality import (
-    discrepancy_sizes,
     errors,
-    fitted,
-    noise_of,
     Unexplained,
     unexplained,
+    where_of,
 )
 from beetle_omni_ros.identify.flights.treatment import separating_experiment, TREATMENTS
 from beetle_omni_ros.model.effects import CATALOGUE
@@ -32,9 +30,6 @@ NAMING = 'named', 'named_set'
 TESTS = 2               # of what is unexplained; they share the accepted probability
 MOST_FED_BACK = 2       # entries that feedback may exclude; with more, the loop hides the robot
 FORM_DEVIATION = 0.1    # of a value: deviation by the error of form of its law
-LEAST_TIME = 1.0        # [s] in a regime, of which an RMS is stated
-UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate': 'rad/s',
-         'joint': 'rad'}
 Starts = dict[str, dict[str, float]]
 
 
@@ -298,53 +293,6 @@ def seen_from(engine: Engine, solution: Solution, keys: dict[str, Key], entry: E
         unit = CATALOGUE[entry.name].parameters[keys[own].parameter].unit
     return {'value': sizes[0] if size <= 1 or name not in starts else None, 'typical': sizes[1],
             'unit': unit}
-
-
-def where_of(engine: Engine, solution: Solution) -> list[dict]:
-    """
-    Disagreement of the robot file by channel and regime of the flight, largest first.
-
-    ``excess``: RMS of the whitened residual over the noise; of a regime, in proportion to the
-    RMS there. Rows of the regime 'flight' are about all samples, with ``excess_after`` of the fit
-    without discrepancy, and ``rms``, ``rms_after`` and ``discrepancy_rms`` of what repeats and is
-    in no entry, with a unit.
-    """
-    known, whitened, raw = engine.known, [], []
-    for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
-        x = fitted(engine, solution, k)
-        whitened.append([(rest / noise_of(found)).reshape(-1, len(engine.channels))
-                         for rest in (found.residual, found.at(x))])
-        raw.append([np.where(flight.mask, flight.linear(at, []).residual, np.nan)
-                    for at in ({}, dict(zip(engine.names[:known], x, strict=False)))])
-    excess, rms = (np.sqrt([np.nanmean(np.concatenate(parts)**2, axis=0)
-                            for parts in zip(*own, strict=True)]) for own in (whitened, raw))
-    rows: list[dict] = [
-        {'channel': name, 'regime': 'flight', 'excess': float(excess[0, c]),
-         'excess_after': float(excess[1, c]), 'rms': float(rms[0, c]),
-         'rms_after': float(rms[1, c]), 'discrepancy_rms': discrepancy,
-         'unit': UNITS[name.partition('_')[0]]}
-        for c, (name, discrepancy) in enumerate(zip(
-            engine.channels, discrepancy_sizes(engine, solution), strict=True))]
-    before = np.concatenate([parts[0] for parts in raw])
-    regime = np.concatenate([regimes_of(flight.motion) for flight in engine.flights])
-    for c, name in enumerate(engine.channels):
-        for text in np.unique(regime):
-            there = before[regime == text, c]
-            there = there[np.isfinite(there)]
-            if len(there) * engine.flights[0].period >= LEAST_TIME:
-                rows.append({'channel': name, 'regime': str(text), 'excess': float(
-                    excess[0, c] * np.sqrt(np.mean(there**2)) / rms[0, c])})
-    return sorted(rows, key=lambda row: -row['excess'])
-
-
-def regimes_of(motion: dict[str, np.ndarray]) -> np.ndarray:
-    """(N,) regime of each sample: rotate, near ground, translate, tilted or hover."""
-    regime = np.full(len(motion['velocity']), 'hover', dtype=object)
-    regime[np.abs(motion['tilt']).max(axis=1) > 1.0] = 'tilted'
-    regime[np.linalg.norm(motion['velocity'], axis=1) > 0.4] = 'translate'
-    regime[motion['position'][:, 2] < 0.6] = 'near ground'
-    regime[np.linalg.norm(motion['rate'], axis=1) > 0.8] = 'rotate'
-    return regime
 
 
 def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: list) -> dict:
