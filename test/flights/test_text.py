@@ -1,6 +1,6 @@
 """Verdicts as sentences, tables and a page."""
 
-from beetle_omni_ros.identify.flights.page import grids, headline
+from beetle_omni_ros.identify.flights.page import grids, headline, seen
 from beetle_omni_ros.identify.flights.picture import gap_page
 from beetle_omni_ros.identify.flights.results import result_of
 
@@ -65,6 +65,18 @@ def test_flights_that_show_less_than_half_of_the_catalogue_decide_nothing():
     unseen = result_of('no_gap', GROUPS, candidates=some, hidden=['mass', 'wind'])
     assert unseen['verdict'] == 'not_decidable' and unseen['next_experiment']
     assert 'cannot decide: most known effects' in unseen['summary']
+
+
+def test_the_least_visible_effects_come_first_with_the_size_from_which_they_are_seen():
+    rows = [{'name': name, 'seen_from': {'value': value, 'typical': typical, 'unit': unit}}
+            for name, value, typical, unit in (
+                ('joint_velocity_limit', 9.3, None, 'rad/s'), ('mass', 4.0, 5.0, '%'),
+                ('joint_torque_limit', None, None, 'N m'), ('joint_offset', 0.3, 0.1, 'rad'),
+                ('joint_offset', 0.05, 0.1, 'rad'), ('tilt_thrust_loss', 0.12, 0.06, '1'))]
+    assert seen(rows, 5).rows == [
+        ['joint torque limit', 'not by these flights', ''], ['tilt thrust loss', '0.12', '0.06'],
+        ['mass', '4 %', '5 %'], ['joint offset', '0.05 rad', '0.1 rad'],
+        ['joint velocity limit', '9.3 rad/s', '']]
 
 
 def test_partial_effects_of_an_undecided_verdict_are_listed_and_not_named():

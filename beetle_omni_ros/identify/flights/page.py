@@ -229,9 +229,9 @@ def evidence(rows: list[dict], most: int) -> Grid:
 
 
 def size_seen(row: dict) -> float:
-    """Least size of a candidate that would have been named, over its typical size."""
+    """Least size of a candidate that would have been named, over its typical size; 0: a limit."""
     seen = row['seen_from']
-    return np.inf if seen['value'] is None else seen['value'] / seen['typical']
+    return np.inf if seen['value'] is None else seen['value'] / (seen['typical'] or np.inf)
 
 
 def visible(rows: list[dict]) -> list[dict]:
@@ -249,13 +249,14 @@ def seen(rows: list[dict], most: int) -> Grid:
         [_spelled(row['name']), _seen_text(row, 'value'), _seen_text(row, 'typical')]
         for row in visible(rows)[:most]], note=(
             'from: size that these flights would have shown in the mean; smaller ones may be '
-            'there. %: of the value in the robot file.'))
+            'there. %: of the value in the robot file. A limit is seen at this value or below.'))
 
 
 def _seen_text(row, key):
     value = row['seen_from'][key]
-    return 'not by these flights' if value is None else \
-        f"{value:.2g} {row['seen_from']['unit']}".removesuffix(' 1')
+    if value is None:
+        return 'not by these flights' if key == 'value' else ''
+    return f"{value:.2g} {row['seen_from']['unit']}".removesuffix(' 1')
 
 
 def _damages(rows):

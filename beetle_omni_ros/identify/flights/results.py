@@ -27,6 +27,7 @@ from beetle_omni_ros.model.effects import CATALOGUE
 ALPHA = 0.05            # probability of a false alarm that is accepted
 CROWD = 4               # members of a set from which the flights do not decide
 NAMING = 'named', 'named_set'
+FAR = 10.0              # largest ratio to the robot file that is stated
 TESTS = 2               # of what is unexplained; they share the accepted probability
 MOST_FED_BACK = 2       # entries that feedback may exclude; with more, the loop hides the robot
 FORM_DEVIATION = 0.1    # of a value: deviation by the error of form of its law
@@ -275,24 +276,22 @@ def seen_from(engine: Engine, solution: Solution, keys: dict[str, Key], entry: E
     """
     Size of an entry's first number with this mean ``evidence``, its typical size, and the unit.
 
-    The unit is % for a share of the robot file. A secant is not valid beyond its start, so that
-    a larger size is None.
+    The unit is % for a share of the robot file. The size of a limit is that of its start. A secant
+    is not valid beyond its start, so that a larger size is None.
     """
-    name, unit = entry.keys[0], '%'
+    name = entry.keys[0]
     size = solution.judge.least([engine.index[key] for key in entry.keys], evidence)
+    own, part = next(iter(starts[name].items())) if name in starts else (
+        name, float(engine.typical[engine.index[name]]))
+    key, known = keys[own], size <= 1 or name not in starts
+    unit = CATALOGUE[entry.name].parameters[key.parameter].unit
+    if not key.relative:
+        return {'value': size * part if known else None, 'unit': unit,
+                'typical': key.typical if name in starts else part}
     if name in starts:
-        own, part = next(iter(starts[name].items()))
-        sizes = [size * abs(part) if size <= 1 else np.inf, keys[own].typical]
-    else:
-        own, typical = name, float(engine.typical[engine.index[name]])
-        sizes = [size * typical, typical]
-    if keys[own].relative:      # a limit is lower
-        sizes = [-100 * float(np.expm1(-x)) if name in starts else 100 * float(np.expm1(x))
-                 for x in sizes]
-    else:
-        unit = CATALOGUE[entry.name].parameters[keys[own].parameter].unit
-    return {'value': sizes[0] if size <= 1 or name not in starts else None, 'typical': sizes[1],
-            'unit': unit}
+        return {'value': key.value(part) if known else None, 'unit': unit, 'typical': None}
+    return {'value': 100 * float(np.expm1(min(size * part, log(FAR)))), 'unit': '%',
+            'typical': 100 * float(np.expm1(part))}
 
 
 def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: list) -> dict:

@@ -126,7 +126,7 @@ class Spectrum:
                                     np.arange(copies + 1))
             for block in range(blocks):
                 for group, (low, high) in enumerate(zip(edges, edges[1:], strict=False)):
-                    rows = s[block, low:high].reshape(-1, len(keys))
+                    rows = s[block, low:high].reshape((high - low) * len(channels), len(keys))
                     info[block, group, keys[:, None], keys] += rows.T @ rows
                     right[block, group, keys] -= rows.T @ r[block, low:high].ravel()
         return info, right
