@@ -62,6 +62,7 @@ class BagFlight:
         period: of the samples [s].
         mask: (M, 16) samples that count.
         rows: (M,) rows of the grid of the signals.
+        time: (M,) times of the samples [s].
         starts: name of a start -> deviations of the keys of its effect.
         tangents: name of a tangent -> start and key.
 
@@ -86,6 +87,7 @@ class BagFlight:
         self.trusted = self._trusted()
         first, count = self._starts[0], self._length * len(self._starts)
         self.rows = first + THIN * np.arange(count // THIN)
+        self.time = self.signals.t[self.rows]
         self._fine = low_pass(WIDEST, 1, p.grid)
         self._poses = low_pass(POSES, 1, p.grid)
         self.mask = np.ones((len(self.rows), len(self.channels)), dtype=bool)
@@ -290,11 +292,6 @@ class BagFlight:
     def motion(self) -> dict[str, np.ndarray]:
         """Velocity (world), quaternion, position and tilts of the samples."""
         return self._inputs({})
-
-    @property
-    def time(self) -> np.ndarray:
-        """(M,) times of the samples [s]."""
-        return self.signals.t[self.rows]
 
     def _servos(self, sets, at):
         """Simulated servos (P, W, M, 4) of each set, with initial states and loads at ``at``."""

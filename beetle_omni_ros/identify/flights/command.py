@@ -127,7 +127,8 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
 def _tables(runs, holdout, robot, p, form, alpha, progress, then):
     declared = Format.load(form)
     flights, judging = (load_tables(paths, robot, declared) for paths in (runs, holdout))
-    result = judged_tables(flights, judging, robot, p, declared, alpha, progress, then)
+    progress('weighing effects')
+    result = judged_tables(flights, judging, robot, p, declared, alpha, then)
     result['meta']['format'] = declared.name
     return result
 

@@ -32,9 +32,7 @@ class Engine(Linearised):
         best, turn = None, 0
         while True:
             turn += 1
-            self.progress(f'linearising, {turn}')
             spectra = self._linearised(theta, etas, spectra)
-            self.progress(f'weighing effects, {turn}')
             solution = self._steady(spectra)
             if turn == MOST_ROUNDS or turn >= ROUNDS and solution.best == best:
                 return self._with_plain(solution)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,7 +36,6 @@ class Linearised:
         curved: starts, and their tangents, of effects without a slope.
         varying: key of a sensor -> typical difference between flights.
         alpha: accepted probability of a false alarm.
-        progress: gets a short text at each stage.
         clock: key that shifts all inputs of the body equations; '': none.
 
     """
@@ -44,7 +43,6 @@ class Linearised:
     def __init__(self, flights: Sequence, priors: dict[str, Prior],
                  entries: list[Entry], bounds: dict[str, tuple[float, float]] | None = None,
                  far: frozenset[str] = frozenset(), alpha: float = 0.05,
-                 progress: Callable[[str], None] = lambda text: None,
                  curved: frozenset[str] = frozenset(), varying: dict[str, float] | None = None,
                  kept: frozenset[str] = frozenset(), clock: str = ''):
         self.flights, self.names, self.entries = list(flights), list(priors), list(entries)
@@ -68,7 +66,7 @@ class Linearised:
         self.owner = np.zeros(self.known, dtype=int)
         for k, entry in enumerate(self.entries):
             self.owner[[self.index[key] for key in entry.keys]] = k
-        self.progress, self.alpha = progress, alpha
+        self.alpha = alpha
         self.far = np.array([name in far for name in self.names[:self.known]])
         self.curved = np.array([name in curved for name in self.names[:self.known]])
 

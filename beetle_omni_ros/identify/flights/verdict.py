@@ -164,7 +164,7 @@ def _delays(robot, p, coarse):
     return deviations, limits
 
 
-def _engine(flights, robot, p, declared, alpha, progress):
+def _engine(flights, robot, p, declared, alpha):
     """Engine of flights of tables with the entries that channels and signals can show."""
     channels, signals, names = flights[0].channels, set(declared.signals), set(FORCES)
     if any(name.startswith('torque') for name in channels):
@@ -188,7 +188,7 @@ def _engine(flights, robot, p, declared, alpha, progress):
         priors |= {name: replace(priors[name], narrow=priors[name].typical)
                     for name, key in keys.items() if key.effect in LAGS}
         entries = [entry for entry in entries if entry.name not in LAGS]
-    return Engine(flights, priors, entries, bounds, far, alpha, progress), keys
+    return Engine(flights, priors, entries, bounds, far, alpha), keys
 
 
 def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
@@ -209,8 +209,7 @@ def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
 
 def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight],
                   robot: RobotParameters, p: GapParameters, declared: Format,
-                  alpha: float = ALPHA, progress: Callable[[str], None] = lambda text: None,
-                  then: Then | None = None) -> dict:
+                  alpha: float = ALPHA, then: Then | None = None) -> dict:
     """
     Results of flights of one format; ``judging`` is held out. ``then`` may add to them.
 
@@ -235,15 +234,14 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
                 for flight in [*flights, *judging] if not flight.usable] + [
         f'{flight.name}: {flight.apart}, so they are not compared'
         for flight in [*flights, *judging] if flight.apart]
-    engine, keys = _engine(usable, robot, p, declared, alpha, progress)
+    engine, keys = _engine(usable, robot, p, declared, alpha)
     solution = engine.run()
     if groups['torque']['used'] and explained(engine, solution, 'torque') < EXPLAINED:
         for flight in [*usable, *judging]:
             flight.without(('torque',), FEEDBACK)
         groups = _groups(usable[0], declared)
-        engine, keys = _engine(usable, robot, p, declared, alpha, progress)
+        engine, keys = _engine(usable, robot, p, declared, alpha)
         solution = engine.run()
-    progress('judging')
     judges = [flight for flight in judging if flight.usable] or usable
     slow = [part for f in usable if (part := f.balance(list(keys_of(robot, SLOW))))]
     if slow:
