@@ -193,7 +193,18 @@ class BagFlight:
                 key, part = factors[name]
                 slopes[:, :, k] = part * of_keys[:, :, keys.index(key)]
         self._runs = {}
-        return Linear(residual, slopes, residual)
+        return Linear(residual, slopes, self._measured(theta))
+
+    def _measured(self, theta):
+        """(M, 16) measurements of the channels."""
+        force, rate, turning = self.signals.imu(theta)
+        world = np.einsum('nij,nj->ni', matrices(self.signals.pose(theta)[1]), force)
+        world[:, 2] -= self.robot.gravity
+        first, count = self._starts[0], self._length * len(self._starts)
+        body = np.concatenate([force, turning], axis=1)
+        seen = within(self._poses, np.concatenate([world, rate], axis=1), 0)
+        return np.concatenate([body[self.rows], seen[self.rows], self._of_joints(
+            self.signals.joints(theta)[3][first:first + count])], axis=1)
 
     def _groups_of(self, start):
         return self.keys[next(iter(self.starts[start]))].groups

@@ -9,11 +9,10 @@ from itertools import combinations
 import numpy as np
 
 from beetle_omni_ros.identify.flights.evidence import Judge, log_prior, normal, Solution
-from beetle_omni_ros.identify.flights.linearised import GROUPS, Linearised
+from beetle_omni_ros.identify.flights.linearised import FORM, GROUPS, Linearised
 from beetle_omni_ros.identify.flights.spectrum import EDGES, Spectrum
 
 ROUNDS, MOST_ROUNDS = 3, 6      # linearisations; more than the least until the best set stays
-FORM = 0.25             # relative error of an entry by its form
 MOST = 8                # entries of a set
 PAIRED = 20             # entries whose pairs are all weighed; others follow from the best set
 

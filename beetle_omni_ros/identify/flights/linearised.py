@@ -10,11 +10,22 @@ import numpy as np
 from beetle_omni_ros.identify.flights.discrepancy import discrepancies
 from beetle_omni_ros.identify.flights.evidence import normal
 from beetle_omni_ros.identify.flights.keys import Entry, Prior
-from beetle_omni_ros.identify.flights.spectrum import pooled, Spectrum, spectrum, whitening
+from beetle_omni_ros.identify.flights.spectrum import (
+    EDGES,
+    pooled,
+    Spectrum,
+    spectrum,
+    whitening,
+)
 
 FREE = 100.0            # typical deviations that known effects may have while noise is learned,
                         # so that the noise holds nothing that they explain
 STEPS = 1.0, 0.5, 0.25, 0.0     # tried parts of a step from a start to fitted values
+FORM = 0.25             # relative error of an entry by its form
+# Share of the variance that motion must explain: noise that feedback answers in phase then biases
+# a factor by less than the error of form.
+MOVED = 1 / (1 + FORM**2)
+IN_LOOP = 'force', 'torque', 'acceleration', 'rate'     # channels with noise that reaches commands
 SAME = 0.04             # share of a typical difference between flights by which one value varies
 FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
 RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
@@ -57,6 +68,7 @@ class Linearised:
         self.index = {name: k for k, name in enumerate(names)}
         self._generic()
         self.filters: list = [None] * len(self.flights)     # (C, L) of each flight
+        self.still: list = [[] for _ in self.flights]   # bands and channels without motion
         self._last: dict = {}       # flight -> point and linear model
         self._phi: dict = {}        # flight -> its filters, and spectrum of the discrepancy
         kinds = [c.split('_')[0] for c in self.channels]
@@ -138,6 +150,44 @@ class Linearised:
         self._learn(spectra := self._spectra(theta, etas))
         self.filters = [self._filter(s, s.noise) for s in spectra]
         self.common = self._filter(max(spectra, key=lambda s: s.band[-1]), pooled(spectra))
+        self.still = self._without_motion(theta, etas)
+
+    @property
+    def without_motion(self) -> list[str]:
+        """Groups of channels that show only means in every flight."""
+        return [kind for kind, own in self._in_loop()
+                if all(sum(each == own for _, each in still) == len(EDGES) - 1
+                       for still in self.still)]
+
+    def _in_loop(self):
+        """Kinds of channels with noise that reaches the commands, and their indices."""
+        found = {kind: [c for c, name in enumerate(self.channels) if name.startswith(kind)]
+                 for kind in IN_LOOP}
+        return [(kind, own) for kind, own in found.items() if own]
+
+    def _without_motion(self, theta, etas):
+        """
+        Bands and channels of each flight in which noise hides the motion, but for the mean.
+
+        A controller at rest answers noise. Then motion and commands correlate with the noise of
+        the sensors, and a fit takes the answer for the robot.
+        """
+        spectra = self._spectra(theta, etas)
+        fit, equations = self._learn(spectra)
+        found = []
+        for k, (flight, each) in enumerate(zip(self.flights, spectra, strict=True)):
+            measured = self._linear(flight, self._at(k, theta + etas[k])).measured
+            whole = self.transformed(k, measured).residual
+            rest = each.at(fit + equations.of_flight(k, fit))
+            still = []
+            for _, own in self._in_loop():
+                for band in range(1, len(EDGES)):
+                    total, left = ((x[:, each.band == band][..., own]**2).sum()
+                                   for x in (whole, rest))
+                    if left >= (1 - MOVED) * total:
+                        still.append((band, own))
+            found.append(still)
+        return found
 
     def _filter(self, spectrum, noise):
         power = np.diagonal(noise, axis1=1, axis2=2)[:spectrum.band[-1] + 1]
@@ -148,6 +198,8 @@ class Linearised:
         self._settle(theta, etas)
         self.acting = self.curved & (theta[:self.known] == 1)
         spectra = self._spectra(theta, etas)
+        for each, still in zip(spectra, self.still, strict=True):
+            each.hidden = still
         self.narrow[self.known:] = self.start[self.known:]
         for each, last in zip(spectra, before, strict=False):
             each.noise = last.noise
@@ -241,7 +293,13 @@ class Linearised:
                 flight.settle(dict(zip(self.names, at, strict=False)))
 
     def _learn(self, spectra, passes=8):
-        """Learn noise and discrepancy around a fit in which every key may be far from the file."""
+        """
+        Learn noise and discrepancy around a fit in which every key may be far from the file.
+
+        Returns:
+            (K,) this fit and its normal equations.
+
+        """
         wide = np.hypot(self.narrow, np.concatenate([np.where(self.far, FREE, 1), np.zeros(
             len(self.names) - self.known)]) * self.typical)
         for _ in range(passes):
@@ -264,3 +322,4 @@ class Linearised:
                 total = move @ covariance @ move.T
                 total[np.ix_(own, own)] += inner
                 each.learn(x, total, prior, weight=len(each.noise[0]) + 2.0)
+        return theta, equations

@@ -1,5 +1,5 @@
 """
-How well a solution explains flights: shares, discrepancies, errors, and what repeats unexplained.
+How well a solution explains flights: discrepancies, errors, and what repeats unexplained.
 
 Two tests look at the residual of forces and torques after the fit. They know nothing of causes.
 
@@ -50,24 +50,6 @@ def fitted(engine: Engine, solution: Solution, k: int) -> np.ndarray:
 def noise_of(found: Spectrum) -> np.ndarray:
     """(F, C) standard deviations of the noise of the coefficients."""
     return np.sqrt(np.diagonal(found.noise, axis1=1, axis2=2))[found.band]
-
-
-def explained(engine: Engine, solution: Solution, group: str) -> float:
-    """Share of the variance of a group's measurements that the fit predicts, by motion."""
-    own = [c for c, name in enumerate(engine.channels) if name.startswith(group)]
-    left = total = 0.0
-    for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
-        # without the generic discrepancy, which predicts what feedback leaves
-        x = fitted(engine, solution, k)
-        # a fit of feedback makes the robot heavier; the inertia is that of the file
-        x[[k for k, name in enumerate(engine.names) if name.startswith('inertia.')]] = 0.0
-        measured = engine.transformed(k, flight.linear({}, []).measured)
-        moving = found.band > 0
-        moving[found.counts[0]:] = False
-        rest, all_of_it = ((x / noise_of(found))[:, moving][:, :, own] for x in (
-            found.at(x), measured.residual))
-        left, total = left + (rest**2).sum(), total + (all_of_it**2).sum()
-    return 1 - left / total
 
 
 def discrepancy_sizes(engine: Engine, solution: Solution) -> list[float]:
@@ -228,6 +210,8 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
         root = np.linalg.inv(np.linalg.cholesky(found.noise[-1][np.ix_(own, own)]))
         a = np.zeros((*small.residual.shape[:2], len(own), effect.shape[2]))
         a[..., small.parts[0][1]] = small.parts[0][2]
+        for band, lost in found.hidden:
+            a[:, np.flatnonzero(small.band == band)[:, None], np.isin(own, lost)] = 0.0
         a = (root @ a[:, :count]).reshape(len(rest), -1, effect.shape[2])
         b = (rest[:, :count][..., own] @ root.T).reshape(len(rest), -1)
         info.append(a.transpose(0, 2, 1) @ a)
@@ -247,8 +231,8 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
                        float(np.sum(gains)), tuple(channels[c] for c in own))
 
 
-def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, ...]
-         ) -> Unexplained:
+def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, ...],
+         own: list[int]) -> Unexplained:
     """
     Test of a periodic force or torque.
 
@@ -256,9 +240,9 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
         spectra: of the flights.
         left: (B, F, C) whitened residual of each flight after the fit.
         channels: names of all channels.
+        own: indices of those that are tested.
 
     """
-    own = spectra[0].parts[0][0]
     # blocks of flights differ in length, and so do their frequencies
     step = max(found.step for found in spectra)
     last = min((rest.shape[1] - 1) * found.step
@@ -285,13 +269,15 @@ def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
     """
     Both tests; the most improbable first.
 
-    Where an entry is excluded, the controller feeds noise back, and what repeats may be its
-    answer; nothing is tested then.
+    Where an entry is excluded, or noise hides the motion, the controller feeds noise back, and
+    what repeats may be its answer; nothing is tested there.
     """
-    if solution.banned:
+    own = [c for c in solution.spectra[0].parts[0][0]
+           if engine.channels[c].split('_')[0] not in engine.without_motion]
+    if solution.banned or not own:
         return []
     left = [found.at(fitted(engine, solution, k))
             for k, found in enumerate(solution.spectra)]
     rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
-            line(solution.spectra, left, engine.channels)]
+            line(solution.spectra, left, engine.channels, own)]
     return sorted(rows, key=lambda row: row.probability)

@@ -27,10 +27,11 @@ from beetle_omni_ros.model.effects import CATALOGUE
 ALPHA = 0.05            # probability of a false alarm that is accepted
 CROWD = 4               # members of a set from which the flights do not decide
 NAMING = 'named', 'named_set'
-FAR = 10.0              # largest ratio to the robot file that is stated
+WIDEST = 9.0            # typical deviations of the widest prior of an entry
 TESTS = 2               # of what is unexplained; they share the accepted probability
 MOST_FED_BACK = 2       # entries that feedback may exclude; with more, the loop hides the robot
 FORM_DEVIATION = 0.1    # of a value: deviation by the error of form of its law
+STILL = 'noise hides the motion, so that only means are compared'
 Starts = dict[str, dict[str, float]]
 
 
@@ -42,7 +43,8 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
 
     Args:
         verdict: a key of :data:`~beetle_omni_ros.identify.flights.page.WORDS`.
-        groups: each group of channels: ``used``, ``channels``, and ``reason`` if not.
+        groups: each group of channels: ``used``, ``channels``, and ``reason`` if not, or
+            if only a part is.
         reason: why no effect is named, as the end of a sentence.
         more: further keys, and those that have another value than that of bad data.
 
@@ -108,7 +110,8 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
     fed_back = sorted(solution.entries[k].name.replace('_', ' ') for k in solution.banned)
     verdict, reason = verdict_of(chance, sets, rest, fed_back, alpha)
     return result_of(
-        verdict, groups, reason,
+        verdict, {**groups, **{kind: groups[kind] | {'reason': STILL}
+                               for kind in engine.without_motion}}, reason,
         effects=[effect for effect, members in zip(effects, sets, strict=True)
                  if verdict in NAMING and len(members) < CROWD],
         partial=[effect for effect, members in zip(effects, sets, strict=True)
@@ -276,21 +279,21 @@ def seen_from(engine: Engine, solution: Solution, keys: dict[str, Key], entry: E
     """
     Size of an entry's first number with this mean ``evidence``, its typical size, and the unit.
 
-    The unit is % for a share of the robot file. The size of a limit is that of its start. A secant
-    is not valid beyond its start, so that a larger size is None.
+    The unit is % for a share of the robot file. The size of a limit is that of its start. A size
+    is None beyond the start, where a secant is not valid, and beyond the widest prior.
     """
     name = entry.keys[0]
     size = solution.judge.least([engine.index[key] for key in entry.keys], evidence)
     own, part = next(iter(starts[name].items())) if name in starts else (
         name, float(engine.typical[engine.index[name]]))
-    key, known = keys[own], size <= 1 or name not in starts
+    key, known = keys[own], size <= (1 if name in starts else WIDEST)
     unit = CATALOGUE[entry.name].parameters[key.parameter].unit
     if not key.relative:
         return {'value': size * part if known else None, 'unit': unit,
                 'typical': key.typical if name in starts else part}
     if name in starts:
         return {'value': key.value(part) if known else None, 'unit': unit, 'typical': None}
-    return {'value': 100 * float(np.expm1(min(size * part, log(FAR)))), 'unit': '%',
+    return {'value': 100 * float(np.expm1(size * part)) if known else None, 'unit': '%',
             'typical': 100 * float(np.expm1(part))}
 
 

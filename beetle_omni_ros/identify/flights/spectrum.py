@@ -10,6 +10,7 @@ follow from it. The filtered coefficients of all bands then share one covariance
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,6 +60,7 @@ class Spectrum:
         counts: number of frequencies that count, of each group.
         step: between frequencies, the first of which is zero [Hz].
         level: whether all bands have the same noise.
+        hidden: bands and channels that do not count, because noise hides the motion.
 
     """
 
@@ -71,6 +73,7 @@ class Spectrum:
     counts: list[int]
     step: float
     level: bool = False
+    hidden: Sequence[tuple[int, list[int]]] = ()
 
     def at(self, x: np.ndarray) -> np.ndarray:
         """(B, F, C) coefficients of the residual at deviations ``x`` (K,)."""
@@ -116,12 +119,15 @@ class Spectrum:
         info = np.zeros((blocks, copies, self.keys, self.keys))
         right = np.zeros((blocks, copies, self.keys))
         for (channels, keys, slopes), most in zip(self.parts, self.counts, strict=True):
-            s, r = np.empty((blocks, most, *slopes.shape[2:])), np.empty(
+            s, r = np.zeros((blocks, most, *slopes.shape[2:])), np.zeros(
                 (blocks, most, len(channels)))
             for k, own in enumerate(self._bands(most)):
-                root = np.linalg.inv(np.linalg.cholesky(self.noise[k][np.ix_(channels, channels)]))
-                s[:, own] = root @ slopes[:, own]
-                r[:, own] = self.residual[:, own][..., channels] @ root.T
+                lost = [c for band, hidden in self.hidden if band == k for c in hidden]
+                seen = np.flatnonzero(~np.isin(channels, lost))
+                noise = self.noise[k][np.ix_(channels[seen], channels[seen])]
+                root = np.linalg.inv(np.linalg.cholesky(noise))
+                s[:, own][:, :, seen] = root @ slopes[:, own][:, :, seen]
+                r[:, own][..., seen] = self.residual[:, own][..., channels[seen]] @ root.T
             edges = np.searchsorted(groups[self.band[:most]] if len(groups) else np.zeros(most),
                                     np.arange(copies + 1))
             for block in range(blocks):

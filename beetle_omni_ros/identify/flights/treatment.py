@@ -171,7 +171,7 @@ TREATMENTS: dict[str, Treatment] = {
     'imu_filter_lag': Treatment(
         {'delay': Size(0.01, 0.002, 'delay')}, 'fast turns',
         ('mocap_time_offset', 'rotor_dead_time'),
-        'turns above 1 rad/s with thrust steps; log the raw gyroscope', 'BAWJ'),
+        'turns above 1 rad/s with thrust steps; log the raw gyroscope', 'BAW'),
     'imu_accelerometer_bias': Treatment(
         {'bias': Size(0.15, 0.03, 'bias_accelerometer')}, 'several attitudes',
         ('wind', 'imu_misalignment', 'joint_offset'),
