@@ -45,11 +45,13 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
 
     Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
     """
-    from beetle_omni_ros.flight.experiment import Experiments
     from beetle_omni_ros.identify.flights.command import run_gap
+    experiments = None
+    if next_task:
+        from beetle_omni_ros.flight.experiment import Experiments as experiments
     return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
                    tolerances=tolerances, form=form, alpha=alpha, next_task=next_task, learn=learn,
-                   experiments=Experiments)
+                   experiments=experiments)
 
 
 def improve(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(

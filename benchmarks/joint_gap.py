@@ -175,7 +175,7 @@ def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> di
                'effects': [[e['names'], e.get('joint'), {
                    key: e['parameters'][key].get('each', e['parameters'][key]['value'])
                    for key in e['parameters']}] for e in [*made['effects'], *made['partial']]],
-               'gains': {c['name']: [c['evidence']['delta_bic'] / 2, c['evidence']['cv_gain'],
+               'gains': {c['name']: [c['evidence']['ln_bayes_factor'], c['evidence']['cv_gain'],
                                      c['evidence']['blocks_positive']]
                          for c in made['candidates']},
                'seconds': time.process_time() - begin}

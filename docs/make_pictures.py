@@ -29,7 +29,7 @@ import beetle_omni_ros as bo
 from beetle_omni_ros.bags.log import motion
 from beetle_omni_ros.flight import comparison_page
 from beetle_omni_ros.flight.campaign import digest
-from beetle_omni_ros.identify.flights.page import picture_of
+from beetle_omni_ros.identify.flights.picture import picture_of
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.show import figures, scene

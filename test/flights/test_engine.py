@@ -67,7 +67,7 @@ def test_evidence_of_one_key_agrees_with_quadrature(positive):
     narrow, typical = np.array([0.001]), np.array([0.02])
     bounds = np.array([[0.0 if positive else -np.inf, np.inf]])
     judge = Judge(found, narrow, typical, bounds, np.array([False]), np.zeros(1, dtype=int), 0.05,
-                  np.array([False]))         # no mixture of widths
+                  np.array([False]), np.zeros(1))      # no mixture of widths
     info, estimate = found.info[0, 0], found.right[0] / found.info[0, 0]
     posterior = judge.posterior((0,))
     slab = np.hypot(narrow[0], typical[0])
@@ -87,7 +87,7 @@ def test_a_tolerance_with_limits_agrees_with_quadrature():
     found = normal([linear_flight(rng, np.array([0.0016]), keys=1)], ['a'], np.zeros(1))
     narrow, low, high = 0.002, -0.002, 0.001
     judge = Judge(found, np.array([narrow]), np.array([0.02]), np.array([[low, high]]),
-                  np.array([True]), np.zeros(1, dtype=int), 0.05, np.array([False]))
+                  np.array([True]), np.zeros(1, dtype=int), 0.05, np.array([False]), np.zeros(1))
     estimate, sigma = judge._profile((0,))[1][0], judge._profile((0,))[2][0, 0]**0.5
     inside = quad(lambda x: norm.pdf(x, 0, narrow) * norm.pdf(estimate, x, sigma), low, high)[0] \
         / (norm.cdf(high, 0, narrow) - norm.cdf(low, 0, narrow))
@@ -98,17 +98,17 @@ def test_a_tolerance_with_limits_agrees_with_quadrature():
     assert judge.posterior(()).theta[0] < high + 3 * sigma
 
 
-def test_evidence_of_a_typical_size_is_the_mean_over_its_estimates():
+def test_an_effect_of_the_least_size_has_the_needed_evidence_in_the_mean():
     rng = np.random.default_rng(4)
     found = normal([linear_flight(rng, np.zeros(1), keys=1)], ['a'], np.zeros(1))
     judge = Judge(found, np.array([0.001]), np.array([0.003]), np.array([[-np.inf, np.inf]]),
-                  np.array([False]), np.zeros(1, dtype=int), 0.05, np.array([False]))
-    slab = np.hypot(0.001, 0.003)
+                  np.array([False]), np.zeros(1, dtype=int), 0.05, np.array([False]), np.zeros(1))
+    size = 0.003 * judge.least([0], 3.0)
     sigma = judge._profile((0,))[2][0, 0]**0.5
-    wide, null = np.hypot(sigma, slab), np.hypot(sigma, 0.001)
-    mean = quad(lambda x: norm.pdf(x, 0, wide) * (norm.logpdf(x, 0, wide)
-                                                  - norm.logpdf(x, 0, null)), -0.05, 0.05)[0]
-    assert judge.expected([0]) == pytest.approx(mean, rel=1e-4) and mean > 0.1
+    wide, null = np.hypot(sigma, np.hypot(0.001, 0.003)), np.hypot(sigma, 0.001)
+    mean = quad(lambda x: norm.pdf(x, size, null) * (norm.logpdf(x, 0, wide)
+                                                     - norm.logpdf(x, 0, null)), -0.1, 0.1)[0]
+    assert mean == pytest.approx(3.0, rel=1e-4)
 
 
 def test_noise_of_a_flexible_fit_is_not_too_small():

@@ -1,12 +1,13 @@
 """Verdicts as sentences, tables and a page."""
 
-from beetle_omni_ros.identify.flights.page import gap_page, grids, headline
+from beetle_omni_ros.identify.flights.page import grids, headline, seen
+from beetle_omni_ros.identify.flights.picture import gap_page
 from beetle_omni_ros.identify.flights.results import result_of
 
 SIZE = {'value': 0.4, 'interval': [0.36, 0.44], 'unit': 'N s/m', 'file': 0.0, 'typical': 0.4}
 DRAG = {'names': ['rotor_drag'], 'parameters': {'coefficient': SIZE},
-        'evidence': {'delta_bic': 80.0}}
-EITHER = {'names': ['mass', 'thrust_coefficient'], 'evidence': {'delta_bic': 20.0}, 'parameters': {
+        'evidence': {'ln_bayes_factor': 40.0}}
+EITHER = {'names': ['mass', 'thrust_coefficient'], 'evidence': DRAG['evidence'], 'parameters': {
     'mass': {'value': 3.3, 'interval': [3.2, 3.5], 'unit': 'kg', 'file': 3.0, 'typical': 0.3}},
     'rivals': [{'name': 'thrust_coefficient', 'parameters': {'scale': {
         'value': 0.91, 'interval': [0.9, 0.92], 'unit': '1', 'file': 1.0, 'typical': 0.05}}}]}
@@ -17,8 +18,8 @@ WHERE = [{'channel': 'force_x', 'regime': 'flight', 'excess': 3.0, 'excess_after
 
 
 def candidate(name):
-    return {'name': name, 'accepted': False, 'reason': '', 'evidence': {'delta_bic': -4.0},
-            'expected_ln_bayes_factor': 1.0}
+    return {'name': name, 'accepted': False, 'reason': '', 'evidence': {'ln_bayes_factor': -2.0},
+            'seen_from': {'value': 0.2, 'typical': 0.1, 'unit': 'N'}}
 
 
 def page(result):
@@ -51,7 +52,7 @@ def test_members_are_told_with_the_numbers_of_their_rotors():
     members = ['rotor_thrust_coefficient[3]', 'rotor_thrust_coefficient[1]']
     result = result_of('named_set', GROUPS, effects=[{
         'names': ['rotor_thrust_coefficient'], 'members': members, 'rotor': 3,
-        'parameters': {'scale': scale}, 'evidence': {'delta_bic': 20.0}}])
+        'parameters': {'scale': scale}, 'evidence': {'ln_bayes_factor': 10.0}}])
     assert headline(result) == f'one of a set: {members[0]} or {members[1]}'
     assert result['summary'].startswith(
         'Rotor thrust coefficient[3] or rotor thrust coefficient[1] of 0.7 +- 0.07')
@@ -60,10 +61,22 @@ def test_members_are_told_with_the_numbers_of_their_rotors():
 def test_flights_that_show_less_than_half_of_the_catalogue_decide_nothing():
     some = [candidate(name) for name in ('mass', 'wind', 'rotor_drag')]
     shown = result_of('no_gap', GROUPS, candidates=some, hidden=['mass'])
-    assert shown['verdict'] == 'no_gap' and 'mass would not have been' in shown['summary']
+    assert shown['verdict'] == 'no_gap' and 'would be: mass below 0.2 N.' in shown['summary']
     unseen = result_of('no_gap', GROUPS, candidates=some, hidden=['mass', 'wind'])
     assert unseen['verdict'] == 'not_decidable' and unseen['next_experiment']
     assert 'cannot decide: most known effects' in unseen['summary']
+
+
+def test_the_least_visible_effects_come_first_with_the_size_from_which_they_are_seen():
+    rows = [{'name': name, 'seen_from': {'value': value, 'typical': typical, 'unit': unit}}
+            for name, value, typical, unit in (
+                ('joint_velocity_limit', 9.3, None, 'rad/s'), ('mass', 4.0, 5.0, '%'),
+                ('joint_torque_limit', None, None, 'N m'), ('joint_offset', 0.3, 0.1, 'rad'),
+                ('joint_offset', 0.05, 0.1, 'rad'), ('tilt_thrust_loss', 0.12, 0.06, '1'))]
+    assert seen(rows, 5).rows == [
+        ['joint torque limit', 'not by these flights', ''], ['tilt thrust loss', '0.12', '0.06'],
+        ['mass', '4 %', '5 %'], ['joint offset', '0.05 rad', '0.1 rad'],
+        ['joint velocity limit', '9.3 rad/s', '']]
 
 
 def test_partial_effects_of_an_undecided_verdict_are_listed_and_not_named():

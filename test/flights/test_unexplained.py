@@ -43,7 +43,7 @@ def both_tests(seeds, **more):
     left = [found.residual for found in spectra]
     filters = [np.eye(1, 2).repeat(6, axis=0)] * len(flights)
     return repeatable(flights, spectra, left, filters, CHANNELS), \
-        line(spectra, left, CHANNELS)
+        line(spectra, left, CHANNELS, list(range(len(CHANNELS))))
 
 
 def test_noise_alone_is_neither_repeatable_nor_a_line():

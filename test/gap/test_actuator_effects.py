@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.flights.bag_flight import starts_of
+from beetle_omni_ros.identify.flights.engine import Engine
+from beetle_omni_ros.identify.flights.keys import Entry, Prior
+from beetle_omni_ros.identify.flights.results import effect_of
 from beetle_omni_ros.identify.flights.servo import (
     module_load,
     simulate,
@@ -162,6 +165,22 @@ def test_a_torque_limit_is_recovered_from_samples_at_the_limit():
     assert all(KEYS[key].value(x) > 0.003 for x in tried)
     found = solved(made, [key], 'J', None, {key: tried[int(np.argmin(rest[1:]))]}, 6)
     assert KEYS[key].value(found[key]) == pytest.approx(0.05, abs=0.003)
+
+
+@pytest.mark.parametrize('factor', [0.1, 0.3, 0.7])
+def test_a_torque_limit_keeps_its_value_when_it_is_linearised_again(factor):
+    made, key = model(flight(servo(effort=0.05))), KEYS['joint_torque_limit.effort_limit']
+    start, tangent = 'joint_torque_limit@0', 'joint_torque_limit@0~joint_torque_limit.effort_limit'
+    made.starts = {start: {key.name: starts_of(key, [made])[0][0] + np.log(factor)}}
+    made.tangents = {tangent: (start, key.name)}
+    # four blocks; the forces of these readings are not those of the thrusts
+    engine = Engine([made] * 4, {start: Prior(0.03, 1.0, 0.0), tangent: Prior(0.001, 0.3, 0.0)},
+                    [Entry(key.effect, (start, tangent), None, False)], {start: (0.0, np.inf)},
+                    curved=frozenset({start, tangent}))
+    solution = engine.run()
+    assert solution.best == (0,)
+    stated = effect_of(solution, engine, KEYS, 0, [0], made.starts)['parameters']['effort_limit']
+    assert stated['value'] == pytest.approx(0.05, rel=0.03)
 
 
 DESCRIBED = RobotParameters.load()

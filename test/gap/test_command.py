@@ -74,7 +74,7 @@ def test_the_json_has_the_fixed_keys(made):
     assert {'flight', 'rotate', 'tilted'} <= {row['regime'] for row in results['where']}
     names = {row['name'] for row in results['candidates']}
     assert {'wind', 'mass', 'rotor_drag', 'joint_command_latency'} <= names
-    assert 'delta_bic' in results['effects'][0]['evidence']
+    assert 'ln_bayes_factor' in results['effects'][0]['evidence']
 
 
 def test_page_terminal_and_the_new_robot_file_state_the_wind(made):

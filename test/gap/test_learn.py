@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 import yaml
 
+from beetle_omni_ros.identify.flights import engine
 from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.body import BodyModel
 from beetle_omni_ros.identify.flights.command import gap_results
@@ -77,6 +78,21 @@ def test_flights_that_the_robot_file_explains_have_no_formula():
     assert result['formula'] == {
         'reason': f'none of {len(library())} terms has enough evidence beside the catalogue'}
     assert result['findings'] == [f"No formula: {result['formula']['reason']}"]
+
+
+def test_a_set_that_replaces_another_is_linearised_at_its_own_values(monkeypatch):
+    own, found = replace(ROBOT, effects={'wind': {'force': WIND},
+                                         'thrust_coefficient': {'scale': 1.5}}), {}
+    recordings = [prepare(read_recording(flight('windy_0')), own, P, False)]
+    monkeypatch.setattr(engine, 'MOST_ROUNDS', 1)
+
+    def then(weighed, solution, *_):
+        entry = next(k for k, e in enumerate(weighed.entries) if e.name == 'thrust_coefficient')
+        for key, each in (('before', solution), ('after', weighed.again(solution, (entry,)))):
+            found[key] = 1.5 * np.exp(each.theta[weighed.index['thrust_coefficient.scale']])
+        return {}
+    judged(recordings, [], own, P, then=then)
+    assert abs(found['before'] - 1) > 0.05 and found['after'] == pytest.approx(1.0, abs=0.02)
 
 
 def test_nothing_is_learned_without_a_held_out_flight_or_beside_a_formula():

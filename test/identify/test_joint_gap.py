@@ -150,7 +150,7 @@ def test_the_command_line_writes_a_file_that_explains_the_log(tmp_path):
     result = json.loads(first.read_text())
     assert result['verdict'] in ('named', 'named_set') and result['gap_before'] > 10
     for effect in result['effects']:
-        assert effect['evidence']['delta_bic'] > 0 and effect['evidence']['cv_gain'] > 0
+        assert effect['evidence']['ln_bayes_factor'] > 0 and effect['evidence']['cv_gain'] > 0
     assert [j['joint'] for j in result['joints']] == [1, 2]
     assert len(RobotParameters.load(new).effects['joint_friction']['coulomb']) == 4
     assert cli.main([str(a) for a in ('gap', log, '--robot', new, '--json', second)]) == 0

@@ -62,6 +62,7 @@ class BagFlight:
         period: of the samples [s].
         mask: (M, 16) samples that count.
         rows: (M,) rows of the grid of the signals.
+        time: (M,) times of the samples [s].
         starts: name of a start -> deviations of the keys of its effect.
         tangents: name of a tangent -> start and key.
 
@@ -86,7 +87,7 @@ class BagFlight:
         self.trusted = self._trusted()
         first, count = self._starts[0], self._length * len(self._starts)
         self.rows = first + THIN * np.arange(count // THIN)
-        self._readings = low_pass(p.smooth_imu, 1, p.grid)
+        self.time = self.signals.t[self.rows]
         self._fine = low_pass(WIDEST, 1, p.grid)
         self._poses = low_pass(POSES, 1, p.grid)
         self.mask = np.ones((len(self.rows), len(self.channels)), dtype=bool)
@@ -116,14 +117,12 @@ class BagFlight:
     def _inputs(self, theta):
         """Inputs of the body equations, name -> (M, width)."""
         s = self.signals
-        thrust, thrust_rate = s.thrust(theta)
+        thrust, thrust_rate = s.smooth_thrust(theta)
         position, quaternion, velocity = s.pose(theta)
         tilt, tilt_rate, tilt_acceleration, _ = s.joints(theta)
         inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': s.imu(theta)[1],
                   'tilt': tilt, 'tilt_rate': tilt_rate, 'tilt_acceleration': tilt_acceleration,
-                  # as the readings are smoothed that the forces are compared with
-                  'thrust': within(self._readings, thrust, 0),
-                  'thrust_rate': within(self._readings, thrust_rate, 0), 'position': position,
+                  'thrust': thrust, 'thrust_rate': thrust_rate, 'position': position,
                   'voltage': s.voltage, 'charge': s.charge,
                   'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0))}
         return {name: values[self.rows] for name, values in inputs.items()}
@@ -167,7 +166,8 @@ class BagFlight:
         ends = {name: self._ends(name, theta, own) for name in names if name in self.starts}
         # the servos of all at once; none of them changes a sensor
         sets = list({frozenset(each.items()): each for each in (
-            theta, *(end for both in ends.values() for end in both))}.items())
+            theta, *(end for name, both in ends.items() for end in both
+                     if 'J' in self._groups_of(name)))}.items())
         runs = self._servos([each for _, each in sets], theta)
         self._runs = dict(zip((key for key, _ in sets), runs, strict=True))
         now = self.residual(theta)
@@ -183,7 +183,7 @@ class BagFlight:
         of_keys = self._slopes(theta, now, keys)
         for k, name in enumerate(names):
             if name in self.starts:
-                groups = ''.join({g for key in self.starts[name] for g in self.keys[key].groups})
+                groups = self._groups_of(name)
                 behind, ahead = (now if end == theta else self.residual(end, groups)
                                  for end in ends[name])
                 for group in groups:
@@ -193,7 +193,21 @@ class BagFlight:
                 key, part = factors[name]
                 slopes[:, :, k] = part * of_keys[:, :, keys.index(key)]
         self._runs = {}
-        return Linear(residual, slopes, residual)
+        return Linear(residual, slopes, self._measured(theta))
+
+    def _measured(self, theta):
+        """(M, 16) measurements of the channels."""
+        force, rate, turning = self.signals.imu(theta)
+        world = np.einsum('nij,nj->ni', matrices(self.signals.pose(theta)[1]), force)
+        world[:, 2] -= self.robot.gravity
+        first, count = self._starts[0], self._length * len(self._starts)
+        body = np.concatenate([force, turning], axis=1)
+        seen = within(self._poses, np.concatenate([world, rate], axis=1), 0)
+        return np.concatenate([body[self.rows], seen[self.rows], self._of_joints(
+            self.signals.joints(theta)[3][first:first + count])], axis=1)
+
+    def _groups_of(self, start):
+        return self.keys[next(iter(self.starts[start]))].groups
 
     def _slopes(self, theta, now, names):
         """(M, 16, K) derivatives by keys at ``theta``, where the residual is ``now``."""
@@ -245,9 +259,9 @@ class BagFlight:
                             for name, factor in own.items()
                             for key, part in self.starts[name].items()}}
 
-    def restart(self, theta: dict[str, float]) -> dict[str, float]:
+    def restart(self, theta: dict[str, float], part: float) -> dict[str, float]:
         """
-        Move the starts that act in ``theta`` to their fitted values.
+        Move the starts that act in ``theta`` by a ``part`` of the way to their fitted values.
 
         All flights share the starts. Where a start acts, its factor becomes one, and its tangents
         become zero.
@@ -255,7 +269,8 @@ class BagFlight:
         new = {name: 1.0 for name in self.starts if theta.get(name)}
         for tangent, (name, key) in self.tangents.items():
             if name in new:
-                self.starts[name][key] *= max(theta[name] + theta.get(tangent, 0.0), LEAST)
+                self.starts[name][key] *= max(
+                    1 + part * (theta[name] + theta.get(tangent, 0.0) - 1), LEAST)
                 new[tangent] = 0.0
         return new
 
@@ -288,11 +303,6 @@ class BagFlight:
     def motion(self) -> dict[str, np.ndarray]:
         """Velocity (world), quaternion, position and tilts of the samples."""
         return self._inputs({})
-
-    @property
-    def time(self) -> np.ndarray:
-        """(M,) times of the samples [s]."""
-        return self.signals.t[self.rows]
 
     def _servos(self, sets, at):
         """Simulated servos (P, W, M, 4) of each set, with initial states and loads at ``at``."""

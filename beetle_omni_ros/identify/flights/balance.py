@@ -16,7 +16,7 @@ from math import log
 import numpy as np
 from scipy.stats import chi2
 
-from beetle_omni_ros.identify.flights.evidence import Posterior
+from beetle_omni_ros.identify.flights.evidence import least_size, Posterior, SCALES
 from beetle_omni_ros.identify.flights.keys import entries_of, keys_of, prior_of
 from beetle_omni_ros.model.parameters import RobotParameters
 
@@ -24,7 +24,6 @@ SLOW = {'rotor_thrust_coefficient', 'rotor_hub_moment', 'centre_of_mass'}
 SESSION = 0.035     # of a rotor's thrust between sessions: 0.3 g, normal flights of CrazyPAD
 FREEDOM = 9         # of this scatter, four flights and three axes: its prior is a Student's t
 SCATTER = SESSION * np.sqrt(FREEDOM / chi2.ppf((np.arange(8) + 0.5) / 8, FREEDOM))
-SCALES = (1.0, 3.0, 9.0)    # times typical: the prior of a candidate is a mixture of these
 
 
 class Balance:
@@ -72,12 +71,12 @@ class Balance:
         """Ln of the probability of one set of entries over that of another."""
         return self.gains[one] - self.gains[other]
 
-    def expected(self, index: list[int]) -> float:
-        """Mean ln of the evidence of keys of typical size [nat], with a normal scatter."""
+    def least(self, index: list[int], evidence: float) -> float:
+        """Typical sizes of keys that have this mean ``evidence``, with a normal scatter."""
         prior = np.diag(1 / (self.narrow**2 + (SESSION * self._rotors)**2))
         known = self.info - self.info @ np.linalg.inv(self.info + prior) @ self.info
         ratio = self.typical[index][:, None] * known[np.ix_(index, index)] * self.typical[index]
-        return float(np.trace(ratio) - np.linalg.slogdet(np.eye(len(ratio)) + ratio)[1]) / 2
+        return least_size(ratio, evidence, SCALES[:1])
 
     def _shapes(self, own):
         """Prior covariances (K, K) of an entry: a load is fixed anywhere, or below a rotor."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from beetle_omni_ros.bags.bag import names_of, runs_in
 from beetle_omni_ros.identify.flights.apply import write_corrected
 from beetle_omni_ros.identify.flights.learn import FORMULA, learned, write_effect
 from beetle_omni_ros.identify.flights.next_flight import Planner
-from beetle_omni_ros.identify.flights.page import gap_page, grids, headline
+from beetle_omni_ros.identify.flights.page import grids, headline
 from beetle_omni_ros.identify.flights.results import ALPHA, result_of
 from beetle_omni_ros.identify.flights.verdict import judged, judged_tables, load_tables
 from beetle_omni_ros.identify.recording.bag import read_recording
@@ -27,7 +28,7 @@ from beetle_omni_ros.identify.recording.flight import (
 from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.identify.recording.table import Format
 from beetle_omni_ros.identify.robot_file import check_differs
-from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_log
+from beetle_omni_ros.identify.servo.log import is_joint_log
 from beetle_omni_ros.model.files import write_json, write_text
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
@@ -90,9 +91,9 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
         for option, path in (('--next', next_task), ('--learn', learn)):
             if path:
                 raise ParameterError(f'{option} {path}: expected flights, not logs of joints')
+        from beetle_omni_ros.identify.servo.compare import analyse_joint_logs
         with console.status('comparing the servos'):
             result, made_page = analyse_joint_logs(runs, holdout, model, robot)
-        html = made_page() if page else ''
     else:
         then = Planner(model, p, experiments(model), next_task) \
             if next_task and experiments else None
@@ -105,17 +106,17 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
             result = learned(results, model, result) if learn else result
         result['meta'] |= {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                            'robot': str(robot) if robot else 'params/robot.yaml', 'alpha': alpha}
-        html = gap_page(result, _damaged(result, [*runs, *holdout])) if page else ''
+        made_page = partial(_page, result, [*runs, *holdout])
     write_json(json_path, result)
     if page:
-        write_text(page, html, 'page')
+        write_text(page, made_page(), 'page')
     written = learn if result.get(FORMULA, {}).get('ranges') else None
     if written:
         write_effect(written, result, model)
-    if apply and result['effects']:
-        write_corrected(apply, result, model, robot, tolerances)
-    _print(console, result)
     corrected = apply if result['effects'] else None
+    if corrected:
+        write_corrected(corrected, result, model, robot, tolerances)
+    _print(console, result)
     more = '--apply FILE a robot file' if result['effects'] else \
         '--learn FILE an effect that no entry has' if result['held_out'] and not learn \
         and 'joints' not in result else '--json FILE all numbers'
@@ -129,7 +130,8 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
 def _tables(runs, holdout, robot, p, form, alpha, progress, then):
     declared = Format.load(form)
     flights, judging = (load_tables(paths, robot, declared) for paths in (runs, holdout))
-    result = judged_tables(flights, judging, robot, p, declared, alpha, progress, then)
+    progress('weighing effects')
+    result = judged_tables(flights, judging, robot, p, declared, alpha, then)
     result['meta']['format'] = declared.name
     return result
 
@@ -158,12 +160,12 @@ def _bags(runs, holdout, robot, p, fix, alpha, progress, then):
     return result
 
 
-def _damaged(result, given):
-    """Recording of the first damage and that damage, or None."""
-    if not result['bad_data']:
-        return None
-    first = result['bad_data'][0]
-    return read_recording(given[names_of(given).index(first['run'])]), first
+def _page(result, given):
+    """The page, with a picture of the first damage if there is one."""
+    from beetle_omni_ros.identify.flights.picture import gap_page
+    damages = result['bad_data']
+    return gap_page(result, (read_recording(given[names_of(given).index(
+        damages[0]['run'])]), damages[0]) if damages else None)
 
 
 def _print(console, result):

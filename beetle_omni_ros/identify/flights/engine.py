@@ -1,144 +1,24 @@
-"""The flight engine: linearise, learn the noise, weigh sets of catalogue entries."""
+"""The flight engine: weigh sets of catalogue entries, linearise again at the best one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
-from beetle_omni_ros.identify.flights.discrepancy import discrepancies
 from beetle_omni_ros.identify.flights.evidence import Judge, log_prior, normal, Solution
-from beetle_omni_ros.identify.flights.keys import Entry, Prior
-from beetle_omni_ros.identify.flights.spectrum import (
-    EDGES,
-    pooled,
-    spectrum,
-    whitening,
-)
+from beetle_omni_ros.identify.flights.linearised import FORM, GROUPS, Linearised
+from beetle_omni_ros.identify.flights.spectrum import EDGES, Spectrum
 
-FREE = 100.0            # typical deviations that known effects may have while noise is learned,
-                        # so that the noise holds nothing that they explain
-ROUNDS = 3              # linearisations
-FORM = 0.25             # relative error of an entry by its form
-SAME = 0.04             # share of a typical difference between flights by which one value varies
+ROUNDS, MOST_ROUNDS = 3, 6      # linearisations; more than the least until the best set stays
 MOST = 8                # entries of a set
 PAIRED = 20             # entries whose pairs are all weighed; others follow from the best set
-FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
-RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
-GROUPS = (0.0, 0.5, 2.0)    # [Hz] lower ends of the groups of bands of the test of constancy
-TURN = 1 / (2 * np.pi * GROUPS[-1])     # [s] one radian there: the phase of an answer of feedback
 
 
-class Engine:
-    """
-    Weighs sets of entries on several flights.
-
-    Args:
-        flights: objects with ``linear(theta, names)``, ``mask``, ``period`` and ``channels``.
-        priors: keys and their priors.
-        entries: catalogue entries that may be named.
-        bounds: smallest and largest value of a key.
-        kept: keys of tolerances that have bounds.
-        far: keys whose deviation may be many times typical.
-        alpha: accepted probability of a false alarm.
-        progress: gets a short text at each stage.
-        clock: key that shifts all inputs of the body equations; '': none.
-
-    """
-
-    def __init__(self, flights: Sequence, priors: dict[str, Prior],
-                 entries: list[Entry], bounds: dict[str, tuple[float, float]] | None = None,
-                 far: frozenset[str] = frozenset(), alpha: float = 0.05,
-                 progress: Callable[[str], None] = lambda text: None,
-                 curved: frozenset[str] = frozenset(), varying: dict[str, float] | None = None,
-                 kept: frozenset[str] = frozenset(), clock: str = ''):
-        self.flights, self.names, self.entries = list(flights), list(priors), list(entries)
-        self.real = len(priors)
-        priors = self._late({**priors, **self._repeat(priors, varying or {})}, clock)
-        names = self.names
-        self.narrow, self.typical, self.flight = (np.array(
-            [getattr(priors[name], kind) for name in names])
-            for kind in ('narrow', 'typical', 'flight'))
-        self.bounds = np.array([(bounds or {}).get(name, (-np.inf, np.inf)) for name in names])
-        self.kept = np.array([name in kept for name in names])
-        self.index = {name: k for k, name in enumerate(names)}
-        self._generic()
-        self.filters: list = [None] * len(self.flights)     # (C, L) of each flight
-        self._last: dict = {}       # flight -> point and linear model
-        kinds = [c.split('_')[0] for c in self.channels]
-        kinds = ['body' if kind in ('force', 'torque') else kind for kind in kinds]
-        self.groups = [np.array([k for k, own in enumerate(kinds) if own == kind])
-                       for kind in dict.fromkeys(kinds)]
-        self.owner = np.zeros(self.known, dtype=int)
-        for k, entry in enumerate(self.entries):
-            self.owner[[self.index[key] for key in entry.keys]] = k
-        self.progress, self.alpha = progress, alpha
-        self.far = np.array([name in far for name in self.names[:self.known]])
-        self.curved = np.array([name in curved for name in self.names[:self.known]])
-
-    def _repeat(self, priors, varying):
-        """
-        Entries of what may differ from flight to flight, with a key for each flight.
-
-        A key of a sensor either has one value in all flights, or one value a flight. The second
-        is an entry beside the first, so that a difference between flights is not named.
-        """
-        # (flight, index of the key, index of its value in this flight)
-        self.repeats: list[tuple[int, int, int]] = []
-        more: dict[str, Prior] = {}
-        if len(self.flights) < 2:
-            return more
-        for entry in [e for e in self.entries if set(e.keys) <= set(varying)]:
-            own = []
-            for k in range(len(self.flights)):
-                for key in entry.keys:
-                    own.append(f'{key}#{k}')
-                    self.repeats.append((k, self.names.index(key), len(self.names)))
-                    self.names.append(own[-1])
-                    more[own[-1]] = Prior(SAME * varying[key], varying[key], 0.0)
-            self.entries.append(replace(entry, keys=tuple(own), varying=True))
-        return more
-
-    def _late(self, priors, clock):
-        """
-        Keys of the answer of feedback: forces and torques that are late, in each group of bands.
-
-        In a band, feedback is a complex factor between the residual and what the commands cause.
-        Its real part looks like a factor of thrust or mass. Its imaginary part looks like late
-        inputs of the body equations; ``clock`` is the key that shifts all of them.
-        """
-        self.late = {}      # column -> key and channels of its slopes
-        for kind in (('force', 'torque') if clock else ()):
-            own = [c for c, name in enumerate(self.flights[0].channels) if name.startswith(kind)]
-            self.late[len(self.names)] = self.names.index(clock), own
-            self.names.append(f'late {kind}')
-            priors = priors | {self.names[-1]: Prior(1e-3 * priors[clock].typical, TURN, 0.0)}
-        return priors
-
-    def _at(self, k, theta):
-        """(R,) values of the real keys in flight k at all keys (K,)."""
-        values = theta[:self.real].copy()
-        for flight, key, own in self.repeats:
-            if flight == k:
-                values[key] += theta[own]
-        return values
-
-    def _generic(self):
-        """Keys of the generic discrepancy: weights of features, by rotors and by world forces."""
-        self.channels = self.flights[0].channels
-        self.generic = discrepancies(self.flights)
-        sources, count = self.generic[0].shape[2:]
-        self.known = len(self.names)
-        index = self.known + np.arange(sources * count).reshape(sources, count)
-        self.weights = [index[:4].ravel(), index[4:].ravel()]   # share one power each
-        self.names += [f'{kind}.{k}' for kind in range(sources) for k in range(count)]
-        size = index.size
-        self.narrow = np.concatenate([self.narrow, np.full(size, RELEVANT / np.sqrt(count))])
-        self.start = self.narrow.copy()
-        self.typical = np.concatenate([self.typical, np.zeros(size)])
-        self.flight = np.concatenate([self.flight, np.zeros(size)])
+class Engine(Linearised):
+    """Weighs sets of entries on several flights; arguments are those of its base."""
 
     def run(self, first: dict[str, float] | None = None) -> Solution:
         """Relinearise, learn the noise and search, several times; ``first``: deviations there."""
@@ -146,44 +26,47 @@ class Engine:
         for name, value in (first or {}).items():
             theta[self.index[name]] = value
         etas = np.zeros((len(self.flights), len(self.names)))
-        self._settle(theta, etas)
-        self._learn(spectra := self._spectra(theta, etas))
-        self.filters = [self._filter(s, s.noise) for s in spectra]
-        self.common = self._filter(max(spectra, key=lambda s: s.band[-1]), pooled(spectra))
-        noise: list[np.ndarray] = []
-        for turn in range(ROUNDS):
-            self.progress(f'linearising, {turn + 1}')
-            self._settle(theta, etas)
-            spectra = self._spectra(theta, etas)
-            self.narrow[self.known:] = self.start[self.known:]
-            for each, before in zip(spectra, noise, strict=False):
-                each.noise = before
-            self._learn(spectra, 2 if turn else 5)      # again from the noise before
-            noise = [each.noise for each in spectra]
-            self.progress(f'weighing effects, {turn + 1}')
+        self._whiten(theta, etas)
+        spectra: list[Spectrum] = []
+        best, turn = None, 0
+        while True:
+            turn += 1
+            spectra = self._linearised(theta, etas, spectra)
             solution = self._steady(spectra)
-            etas = np.array([solution.equations.of_flight(k, solution.theta)[:len(self.names)]
-                             for k in range(len(spectra))])
-            etas[:, :self.known][:, self.curved] = 0.0
-            theta = self._next(solution)
-            if turn == ROUNDS - 1:
-                break
-            if self.curved.any():
-                starts = self.flights[0].restart(dict(zip(self.names, theta[:self.known],
-                                                          strict=False)))
-                for name, value in starts.items():
-                    theta[self.index[name]] = value
-        solution.plain = self._weighing(spectra, solution.banned, 1e-9 * self.start[self.known:])
+            if turn == MOST_ROUNDS or turn >= ROUNDS and solution.best == best:
+                return self._with_plain(solution)
+            best = solution.best
+            theta, etas = self._next(solution)
+
+    def again(self, solution: Solution, chosen: tuple[int, ...]) -> Solution:
+        """The set ``chosen``, linearised at its own values; nothing is searched."""
+        judge = solution.judge
+        for _ in range(ROUNDS):
+            solution = replace(solution, best=chosen, judge=judge, equations=judge.equations,
+                               posterior=judge.posterior(self.indices(chosen)))
+            theta, etas = self._next(solution)
+            solution.spectra = self._linearised(theta, etas, solution.spectra)
+            judge = self._weighing(solution.spectra, solution.banned, self.narrow[self.known:])
+        return self._with_plain(replace(
+            solution, judge=judge, equations=judge.equations,
+            posterior=judge.posterior(self.indices(chosen))))
+
+    def _with_plain(self, solution):
+        solution.plain = self._weighing(solution.spectra, solution.banned,
+                                        1e-9 * self.start[self.known:])
         return solution
 
     def _next(self, solution):
-        """(K,) point of the next linearisation: no starts but those of the best set."""
+        """Point of the next linearisation, common and of flights: starts of the best set only."""
+        etas = np.array([solution.equations.of_flight(k, solution.theta)[:len(self.names)]
+                         for k in range(len(self.flights))])
+        etas[:, :self.known][:, self.curved] = 0.0
         theta = np.zeros(len(self.names))
         theta[:self.known] = solution.theta[:self.known]
         theta[:self.known][self.curved] = 0.0
         own = self.indices(solution.best)
         theta[own] = solution.theta[own]
-        return theta
+        return self._restarted(theta, etas, solution.spectra), etas
 
     def _steady(self, spectra):
         """
@@ -202,78 +85,6 @@ class Engine:
                 solution.banned = banned
                 return solution
             banned[worst] = solution.unsteady[worst]
-
-    def _spectra(self, theta, etas, fitted=True):
-        """Spectra of the flights; the keys of each flight are those of the ``fitted`` ones."""
-        spectra = []
-        for k, (flight, eta, phi, own) in enumerate(zip(
-                self.flights, etas, self.generic, self.filters, strict=True)):
-            at = self._at(k if fitted else -1, theta + eta)
-            linear = self._linear(flight, at)
-            # linear about the robot file
-            residual = linear.residual - linear.slopes @ at
-            slopes = np.zeros((len(self.names), *residual.T.shape)).T     # times are contiguous
-            slopes[:, :, :self.real] = linear.slopes
-            for at_flight, key, column in self.repeats:
-                if fitted and at_flight == k:
-                    slopes[:, :, column] = linear.slopes[:, :, key]
-            for column, (key, rows) in self.late.items():
-                slopes[:, rows, column] = linear.slopes[:, rows, key]
-            slopes[:, :, self.known:] = -phi.reshape(*residual.shape, -1)
-            floor = np.array([FLOORS[c.split('_')[0]] for c in flight.channels])
-            found = spectrum(residual, slopes, flight.mask, flight.period, floor,
-                             flight.highest, self.groups, own)
-            spectra.append(found)
-        return spectra
-
-    def others(self, flights: Sequence, theta: np.ndarray) -> tuple[list, bool]:
-        """Spectra of flights at ``theta`` (K,), common filter; whether they are the fitted."""
-        keep, fitted = (self.flights, self.generic, self.filters), list(flights) == self.flights
-        self.flights, self.filters = list(flights), [self.common] * len(flights)
-        self.generic = discrepancies(self.flights)
-        spectra = self._spectra(theta, np.zeros((len(flights), len(self.names))), fitted)
-        self.flights, self.generic, self.filters = keep
-        return spectra, fitted
-
-    def _linear(self, flight, at):
-        """Linear model of a flight at real keys; the last one is kept."""
-        point, linear = self._last.get(flight, (None, None))
-        if point is None or not np.array_equal(point, at):
-            linear = flight.linear(dict(zip(self.names, at, strict=False)),
-                                   self.names[:self.real])
-            self._last[flight] = at, linear
-        return linear
-
-    def _settle(self, theta, etas):
-        for k, (flight, eta) in enumerate(zip(self.flights, etas, strict=True)):
-            at = self._at(k, theta + eta)
-            if not np.array_equal(self._last.get(flight, (None, None))[0], at):
-                flight.settle(dict(zip(self.names, at, strict=False)))
-
-    def _learn(self, spectra, passes=8):
-        """Learn noise and discrepancy around a fit in which every key may be far from the file."""
-        wide = np.hypot(self.narrow, np.concatenate([np.where(self.far, FREE, 1), np.zeros(
-            len(self.names) - self.known)]) * self.typical)
-        for _ in range(passes):
-            equations = normal(spectra, self.names, self.flight)
-            # in units of the priors, so that the sum is well conditioned
-            covariance = wide[:, None] * np.linalg.inv(
-                wide[:, None] * equations.info * wide + np.eye(len(wide))) * wide
-            theta = covariance @ equations.right
-            for own in self.weights:
-                # each weight has its own power, with the median of its kind as one observation
-                power = theta[own]**2 + np.diag(covariance)[own]
-                self.narrow[own] = wide[own] = np.sqrt(0.5 * (power + np.median(power)))
-            prior = pooled(spectra)
-            for k, each in enumerate(spectra):
-                own, inner, left, right = equations.flights[k]
-                x = theta + equations.of_flight(k, theta)
-                # theta + eta, eta = a - b theta + its own scatter
-                move = np.eye(len(theta))
-                move[own] -= inner @ left
-                total = move @ covariance @ move.T
-                total[np.ix_(own, own)] += inner
-                each.learn(x, total, prior, weight=len(each.noise[0]) + 2.0)
 
     def indices(self, chosen: Sequence[int]) -> list[int]:
         """Indices of the keys of some entries."""
@@ -336,10 +147,6 @@ class Engine:
         return judge.gain(self.indices(one), self.indices(other)) \
             + log_prior(len(one), total) - log_prior(len(other), total)
 
-    def _filter(self, spectrum, noise):
-        power = np.diagonal(noise, axis1=1, axis2=2)[:spectrum.band[-1] + 1]
-        return whitening(power, self.flights[0].period)
-
     def _split(self, spectra, banned, generic, entry=None):
         """
         Normal equations with separate values for the groups of bands, and their judge.
@@ -388,4 +195,5 @@ class Engine:
                      np.concatenate([self.bounds, np.tile([-np.inf, np.inf], (more, 1))]),
                      np.concatenate([self.kept, flat]),
                      np.concatenate([self.owner, np.full(more, len(self.entries))]),
-                     self.alpha / len(self.entries), np.concatenate([self.far, flat]))
+                     self.alpha / len(self.entries), np.concatenate([self.far, flat]),
+                     np.concatenate([self.acting, flat]))

@@ -16,17 +16,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
-from math import comb, exp, inf, log, log1p, pi, sqrt
+from math import comb, inf, log, pi, sqrt
 
 import numpy as np
-from scipy.special import log_ndtr
 
 from beetle_omni_ros.identify.flights.keys import Entry
-from beetle_omni_ros.identify.flights.spectrum import Spectrum
-from beetle_omni_ros.identify.inference.noise import few_blocks
+from beetle_omni_ros.identify.flights.spectrum import NONE, Spectrum
+from beetle_omni_ros.identify.inference.noise import few_blocks, within_limits
 
-NONE = np.zeros(0, dtype=int)
+SCALES = 1.0, 3.0, 9.0  # times typical: the prior of a candidate is a mixture of these
+MIXED = log(len(SCALES))    # its price
+EXACT = 1e-3            # deviation of a factor that is one
 
 
 @dataclass(eq=False)
@@ -95,16 +95,16 @@ def normal(spectra: Sequence[Spectrum], names: list[str], flight: np.ndarray,
     info, right, noise = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
     scores, slopes, flights = [], [], []
     for each in spectra:
-        g, h = each.grams()
+        g, h = each.grams(groups if len(split) else NONE)
         gs, hs = np.zeros((len(g), size, size)), np.zeros((len(g), size))
         gs[:, :count, :count], hs[:, :count] = g.sum(axis=1), h.sum(axis=1)
-        for group in range(copies):
-            part = g[:, groups == group].sum(axis=1)
+        for group in range(copies if len(split) else 0):
+            part = g[:, group]
             at = count + group * len(split) + np.arange(len(split))
             gs[:, :count, at] = part[:, :, split]
             gs[:, at, :count] = part[:, split]
             gs[:, at[:, None], at] = part[:, split][:, :, split]
-            hs[:, at] = h[:, groups == group].sum(axis=1)[:, split]
+            hs[:, at] = h[:, group][:, split]
         ge, gee, he = gs[:, own], gs[:, own][:, :, own], hs[:, own]
         inner = np.linalg.inv(gee.sum(axis=0) + np.diag(flight[own]**-2))
         left, right_e = ge.sum(axis=0), he.sum(axis=0)
@@ -178,12 +178,14 @@ class Judge:
         owner: (K,) index of the entry of each key.
         level: probability at which the widening by few blocks holds.
         far: (K,) keys whose deviation may be much larger than typical; not those of sensors.
+        acting: (K,) factors of effects that act at the point of linearisation. A set that has
+            such an effect has it as linearised, with a factor of one.
 
     """
 
     def __init__(self, equations: Normal, narrow: np.ndarray, typical: np.ndarray,
                  bounds: np.ndarray, kept: np.ndarray, owner: np.ndarray, level: float,
-                 far: np.ndarray):
+                 far: np.ndarray, acting: np.ndarray):
         self.equations, self.narrow, self.typical = equations, narrow, typical
         self.bounds, self.kept = bounds.tolist(), kept
         self.bounded = np.isfinite(bounds).any(axis=1)
@@ -191,7 +193,7 @@ class Judge:
         self.covariance = np.linalg.inv(equations.info + np.diag(narrow**-2))
         self.mean = self.covariance @ equations.right
         self.blocks = len(equations.scores)
-        self.owner, self.far = owner, far
+        self.owner, self.far, self.acting = owner, far, acting
         self.student = few_blocks(level, self.blocks)
         self._kept: dict[tuple[int, ...], Posterior] = {}
         self._profiles: dict[tuple[int, ...], tuple] = {}
@@ -223,24 +225,18 @@ class Judge:
         for chosen, sign in ((one, 1.0), (other, -1.0)):
             free = _among(c, chosen)
             prior = np.where(free, slab, self.narrow[c])
-            total += sign * (self._bounded(c, estimate, wide, prior, free)[0] - log(3) * len(
+            total += sign * (self._bounded(c, estimate, wide, prior, free)[0] - MIXED * len(
                 np.unique(self.owner[c[free & self.far[c]]])))
         return float(total)
 
-    def expected(self, index: list[int]) -> float:
-        """
-        Mean ln of the evidence that keys would have, if they had their typical size [nat].
-
-        With the covariance C of the estimate, and the variances N of the narrow and S of the wide
-        prior, the estimate would scatter by C + S about the robot file, so that the mean of its
-        log density ratio is the divergence of both normal densities.
-        """
+    def least(self, index: list[int], evidence: float) -> float:
+        """Typical sizes of some keys that have this mean ``evidence``; see :func:`least_size`."""
         c, _, wide, _, _ = self._profile(tuple(sorted(index)))
         free = _among(c, index)
-        null = wide + np.diag(self.narrow[c]**2)
-        ratio = np.linalg.solve(null, null + np.diag(free * self.typical[c]**2))
-        return float(0.5 * (np.trace(ratio) - len(c) - np.linalg.slogdet(ratio)[1])
-                     - log(3) * self.far[c[free]].any())
+        far = bool(self.far[c[free]].any())
+        ratio = np.linalg.solve(wide + np.diag(self.narrow[c]**2), np.diag(
+            free * self.typical[c]**2))
+        return least_size(ratio, evidence + MIXED * far, SCALES if far else SCALES[:1])
 
     def _profile(self, index):
         """Keys, estimate and its covariance, change of all keys by them, prior deviations."""
@@ -257,8 +253,9 @@ class Judge:
         info = vectors @ np.diag(np.maximum(values, 1e-9 * self.narrow[c].min()**-2)) @ vectors.T
         score = own @ self.mean[c]
         estimate = np.linalg.solve(info, score)
-        slab = np.hypot(self.narrow[c], self._scales(c, estimate) * self.typical[c])
-        fitted = np.linalg.solve(info + np.diag(slab**-2), score)
+        slab = np.where(self.acting[c], EXACT, np.hypot(
+            self.narrow[c], self._scales(c, estimate) * self.typical[c]))
+        fitted = np.linalg.solve(info + np.diag(slab**-2), score + self.acting[c] * slab**-2)
         theta = self.mean + direction @ (fitted - self.mean[c])
         wide = self.widened(direction, info, theta)
         self._profiles[index] = c, estimate, wide, direction, slab
@@ -277,7 +274,7 @@ class Judge:
             own = self.owner[c] == owner
             if self.far[c][own].all():
                 group[own] = np.searchsorted((1.5, 4.5), ratio[own].max())
-        return 3.0**group
+        return np.array(SCALES)[group]
 
     def widened(self, direction, info, theta):
         """
@@ -301,13 +298,15 @@ class Judge:
         """
         Ln of the density of an estimate, and mean and covariance of its keys within their bounds.
 
-        The priors are normal and end at the bounds. The bounds of one key after the other cut the
+        The priors are normal about zero, or about one for the factor of an effect that acts, and
+        end at the bounds. The bounds of one key after the other cut the
         posterior, which stays normal with the mean and the covariance of what remains. The upper
         limit of a tolerance does not hold for a candidate. The lower one is physical.
         """
         if not len(c):
             return 0.0, estimate, wide
-        variance = prior**2
+        variance, centre = prior**2, free * self.acting[c]
+        estimate = estimate - centre
         both = wide + np.diag(variance)
         inverse = np.linalg.inv(both)
         # the normal density of an estimate with the covariance of noise and prior
@@ -315,33 +314,16 @@ class Judge:
         share = variance[:, None] * inverse
         total, mean = np.diag(variance) - share * variance, share @ estimate
         for k in np.flatnonzero(self.bounded[c]):
-            (low, high), size = self.bounds[c[k]], float(prior[k])
+            (low, high), size = np.subtract(self.bounds[c[k]], centre[k]), float(prior[k])
             high = inf if free[k] and self.kept[c[k]] else high
             deviation, middle = sqrt(total[k, k]), float(mean[k])
-            chance, shift, left = _within((low - middle) / deviation, (high - middle) / deviation)
-            value += chance - _within(low / size, high / size)[0]
+            chance, shift, left = within_limits(
+                (low - middle) / deviation, (high - middle) / deviation)
+            value += chance - within_limits(low / size, high / size)[0]
             change = total[:, k] / total[k, k]
             mean = mean + change * (shift * deviation)
             total = total - change[:, None] * (total[k] * (1 - left))
-        return value, mean, total
-
-
-@lru_cache(100_000)      # the same priors end at the same bounds in most sets
-def _within(low: float, high: float) -> tuple[float, float, float]:
-    """Ln of the probability that a standard normal is between limits; its mean, variance there."""
-    if low + high > 0:
-        chance, mean, variance = _within(-high, -low)
-        return chance, -mean, variance
-    upper = float(log_ndtr(high))
-    less = float(log_ndtr(low)) - upper if low > -inf else -inf
-    chance = upper + log1p(-exp(min(less, -1e-12)))
-    mean = edge = 0.0
-    for sign, x in ((1, low), (-1, high)):
-        if abs(x) < inf:
-            density = sign * exp(-0.5 * x * x - 0.5 * log(2 * pi) - chance)
-            mean += density
-            edge += x * density
-    return chance, mean, min(max(1 + edge - mean * mean, 1e-6), 1.0)
+        return value, mean + centre, total
 
 
 def _among(keys, chosen):
@@ -392,6 +374,25 @@ class Solution:
             effect = not all(self.entries[k].varying for k in chosen)
             parts[effect].append(log_prior(len(chosen), len(self.entries)) + gain)
         return float(np.logaddexp.reduce(parts[True]) - np.logaddexp.reduce(parts[False]))
+
+
+def least_size(ratio: np.ndarray, evidence: float, scales: Sequence[float]) -> float:
+    """
+    Typical sizes from which an effect has the mean ``evidence`` [nat].
+
+    Args:
+        ratio: (d, d) variance of its typical size, over that of an estimate without it, N.
+        evidence: ln of densities with the variances N (1 + scale^2 ratio) and N.
+        scales: of the wide prior; the best one counts.
+
+    """
+    own = np.linalg.eigvals(ratio).real
+    sizes = []
+    for wide in [scale**2 * own for scale in scales]:
+        share = wide / (1 + wide)
+        sizes.append((2 * evidence + (np.log1p(wide) - share).sum())
+                     / max((own * share).sum(), 1e-12))
+    return sqrt(min(sizes))
 
 
 def log_prior(size: int, count: int) -> float:

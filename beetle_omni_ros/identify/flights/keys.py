@@ -198,8 +198,8 @@ def extra_keys() -> dict[str, Key]:
         add(f'rotor.lag[{k}]', k, 0.1, 'B', step=0.02)
         for gain in ('kp', 'kd'):
             add(f'servo.{gain}[{k}]', k, 0.3, 'J', step=0.01)
-    for name in (TILT_BUS, THRUST_BUS):
-        add(name, None, 0.005, 'BJ', parameter='delay')
+    for name, groups in ((TILT_BUS, 'J'), (THRUST_BUS, 'B')):
+        add(name, None, 0.005, groups, parameter='delay')
     return keys
 
 

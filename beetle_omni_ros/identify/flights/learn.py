@@ -81,13 +81,13 @@ def _formula(terms, before, engine, solution, result, starts, judges):
     if not own:
         return f'none of {len(terms)} terms has enough evidence beside the catalogue'
     rest, chosen = best - set(own), tuple(sorted(best))
-    solution = replace(solution, best=chosen, posterior=judge.posterior(engine.indices(chosen)))
     accepted = {label(row) for row in before['candidates'] if row['accepted']}
     known = {k for k, entry in enumerate(entries) if not entry.varying and label(
         {'name': entry.name, 'rotor': entry.member}) in accepted}
     more = min(gain(chosen, other) for other in (rest, known, rest | known))
     if more < log(1 / engine.alpha):
         return 'it would not be more probable than the entries of the catalogue'
+    solution = engine.again(solution, chosen)
     at, after, floor, closure = errors(engine, solution, own, judges)
     if closure is None or closure < CLOSED:
         return f'the best one of {MOST} terms closes {max(closure or 0, 0):.0%} of the gap on ' \

@@ -1,19 +1,12 @@
-"""Results of `beetle_omni gap` as one sentence, as tables and as an HTML page."""
+"""Results of `beetle_omni gap` as one sentence and as tables."""
 
 from __future__ import annotations
 
-from math import log
-
-import matplotlib
-from matplotlib.figure import Figure
 import numpy as np
 
-from beetle_omni_ros.identify.recording.bag import Recording
-from beetle_omni_ros.identify.recording.topics import begin_of
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.formula import described
-from beetle_omni_ros.show import figures
-from beetle_omni_ros.show.page import ABSENT, Grid, html, page, section, verdict_head
+from beetle_omni_ros.show.page import ABSENT, Grid
 
 WORDS = {'no_gap': 'no gap', 'named': 'named', 'named_set': 'one of a set',
          'unknown': 'unknown: none of the known effects', 'not_decidable': 'not decidable',
@@ -23,16 +16,6 @@ LOPSIDED = 0.2          # asymmetry of an interval from which a sentence states 
 SPELLED = {'imu': 'IMU', 'mocap': 'MoCap'}
 SHOWN = 6               # channels and candidates in the terminal
 LEAST_CHANCE = 1e-6     # below, a probability is not stated as a number
-VERDICT_COLOURS = {'no_gap': figures.GREEN, 'bad_data': figures.RED,
-                   **dict.fromkeys(('named', 'named_set'), figures.BLUE),
-                   **dict.fromkeys(('unknown', 'not_decidable'), figures.AMBER)}
-# Topic -> label of an axis -> names of its readings.
-LABELS = {
-    'imu/data_raw': {'force [m/s^2]': 'xyz', 'rate [rad/s]': 'xyz'},
-    'mocap/pose': {'position [m]': 'xyz', 'quaternion': 'xyzw'},
-    'joint_states': {'tilt [rad]': '1234'},
-    'command': {'tilt [rad]': '1234', 'thrust [N]': '1234'}}
-HEIGHT = 0.24   # [in] of a row of a figure
 
 
 def headline(result: dict) -> str:
@@ -62,8 +45,10 @@ def summary(result: dict) -> str:
         text = 'Model and measurement agree to within noise and manufacturing tolerance.'
         if not result['hidden']:
             return f'{text} Every known effect of typical size would have been detected.'
-        return (f'{text} An effect of typical size of {listed(result["hidden"], "or")} would not '
-                'have been detected in these data.')
+        sizes = [_spelled(row['name']) + ('' if row['seen_from']['value'] is None else (
+            f" below {_seen_text(row, 'value')}")) for row in visible(result['candidates'])
+            if row['name'] in result['hidden']]
+        return f'{text} Not visible in these data would be: {listed(sizes, "or")}.'
     if verdict == 'not_decidable':
         return f'These data cannot decide: {reason}.'
     if verdict == 'unknown':
@@ -155,9 +140,11 @@ def grids(result: dict, brief: bool = True) -> list[Grid]:
     if brief:
         where = where[:SHOWN]
         groups = {} if all(group['used'] for group in groups.values()) else groups
+    blind = result['verdict'] in ('no_gap', 'not_decidable')
     tables = [_damages(result['bad_data']), _effects(result), _formula(result), _gap(result),
               _channels(where), _groups(groups),
-              evidence(result['candidates'], SHOWN if brief else 0)]
+              evidence(result['candidates'], SHOWN if brief else 0),
+              seen(result['candidates'], SHOWN if brief and blind else 0)]
     return [grid for grid in tables if grid.rows]
 
 
@@ -169,7 +156,7 @@ def whole(result: dict) -> list[dict]:
 def _effects(result):
     rows = []
     for effect in result['effects'] or result['partial']:
-        ln = f"{effect['evidence']['delta_bic'] / 2:.0f}"
+        ln = f"{effect['evidence']['ln_bayes_factor']:.0f}"
         for first, one in [(label(effect), effect), *(
                 (f'or {label(rival)}', rival) for rival in effect.get('rivals', []))]:
             for k, (name, entry) in enumerate(one['parameters'].items()):
@@ -234,18 +221,42 @@ def _groups(groups):
 
 def evidence(rows: list[dict], most: int) -> Grid:
     """Table of candidates, the first ``most``."""
-    typical = any(row.get('expected_ln_bayes_factor') is not None for row in rows)
-    shown = [[label(row), _cell(_half(row['evidence']['delta_bic'])),
-              *([_cell(row['expected_ln_bayes_factor'])] if typical else []),
+    shown = [[label(row), _cell(row['evidence']['ln_bayes_factor']),
               'accepted' if row['accepted'] else row['reason']] for row in rows[:most]]
-    note = 'ln B: evidence for the entry alone. typical: what an effect of typical size would ' \
-        'have in the mean.' if typical else 'ln B: evidence beside the accepted entries.'
-    return Grid('Candidates', ['entry', 'ln B', *(['typical'] if typical else []), 'decision'],
-                shown, note=note)
+    alone = any('seen_from' in row for row in rows)
+    return Grid('Candidates', ['entry', 'ln B', 'decision'], shown, note=(
+        f'ln B: evidence {"for the entry alone" if alone else "beside the accepted entries"}.'))
 
 
-def _half(value):
-    return None if value is None else value / 2
+def size_seen(row: dict) -> float:
+    """Least size of a candidate that would have been named, over its typical size; 0: a limit."""
+    seen = row['seen_from']
+    return np.inf if seen['value'] is None else seen['value'] / (seen['typical'] or np.inf)
+
+
+def visible(rows: list[dict]) -> list[dict]:
+    """Candidates, each name with its most visible member; the least visible first."""
+    best: dict[str, dict] = {}
+    for row in rows:
+        if 'seen_from' in row:
+            best[row['name']] = min(best.get(row['name'], row), row, key=size_seen)
+    return sorted(best.values(), key=size_seen, reverse=True)
+
+
+def seen(rows: list[dict], most: int) -> Grid:
+    """Table of the sizes from which effects would have been named, the first ``most``."""
+    return Grid('What would have been seen', ['effect', 'from', 'typical'], [
+        [_spelled(row['name']), _seen_text(row, 'value'), _seen_text(row, 'typical')]
+        for row in visible(rows)[:most]], note=(
+            'from: size that these flights would have shown in the mean; smaller ones may be '
+            'there. %: of the value in the robot file. A limit is seen at this value or below.'))
+
+
+def _seen_text(row, key):
+    value = row['seen_from'][key]
+    if value is None:
+        return 'not by these flights' if key == 'value' else ''
+    return f"{value:.2g} {row['seen_from']['unit']}".removesuffix(' 1')
 
 
 def _damages(rows):
@@ -274,106 +285,3 @@ def _spans(interval):
     if isinstance(interval[0], list):
         return ', '.join(f'{a:.3g}..{b:.3g}' for a, b in interval)
     return f'{interval[0]:.4g}..{interval[1]:.4g}'
-
-
-def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str:
-    """One self-contained page; ``damaged``: a recording and the first of its damages."""
-    notes = [f'Next experiment: {result["next_experiment"]}.'] \
-        if result['next_experiment'] else []
-    notes += dict.fromkeys(result['findings'])
-    candidates, sections = result['candidates'], []
-    if candidates:
-        least = log(1 / result['meta']['alpha'])
-        sections = [
-            section('Evidence', 'Every entry of the catalogue that these flights were compared '
-                    'with. An effect is named if its evidence outweighs the number of entries '
-                    f'that were tried and the accepted probability of a false alarm ({least:.1f} '
-                    'nat).', html(evidence(candidates, len(candidates)))),
-            section('Tolerances', 'Deviations of this robot from the robot file, as fitted and '
-                    'not named; --tolerances writes masses, gains, lags and rotor positions to '
-                    'the robot file.', '<details><summary>All numbers</summary>'
-                    f'{html(_tolerances(result))}</details>')]
-    with matplotlib.rc_context(figures.STYLE):
-        picture = figures.svg(_damage(*damaged), 'damaged readings') if damaged else figures.svg(
-            picture_of(result), 'disagreement and sizes') if result['where'] else ''
-    return page('Gap', _about(result['meta']), grids(result, brief=False), notes, sections,
-                head(result, picture))
-
-
-def _about(meta):
-    """Flights and robot file in one line."""
-    parts = {'flights': meta['runs'], 'held out': meta['holdout'],
-             'robot file': [meta['robot']]}
-    return '; '.join(f'{word}: {", ".join(runs)}' for word, runs in parts.items() if runs)
-
-
-def head(result: dict, picture: str = '') -> str:
-    """Head of the page: verdict, sentence and picture, as HTML."""
-    return verdict_head(headline(result), VERDICT_COLOURS[result['verdict']], result['summary'],
-                        picture)
-
-
-def picture_of(result: dict) -> Figure:
-    """Disagreement by channel before and after, and the sizes of the effects with intervals."""
-    sizes = _sizes(result['effects'] or result['partial'])
-    rows = sorted(whole(result), key=lambda row: row['channel'])[::-1]
-    height = HEIGHT * max(len(rows), len(sizes)) + 0.6
-    figure, axes = figures.panels(1, 2 if sizes else 1, height=height)
-    place = np.arange(len(rows))
-    for key, shift, colour, text in (('excess', 0.18, figures.BEFORE, 'robot file'),
-                                     ('excess_after', -0.18, figures.AFTER, 'fit')):
-        axes[0, 0].barh(place + shift, [row[key] for row in rows], 0.36, color=colour, label=text)
-    axes[0, 0].axvline(1.0, color=figures.FAINT, ls='--', lw=0.9, label='noise')
-    axes[0, 0].set_yticks(place, [row['channel'] for row in rows])
-    axes[0, 0].set_xlabel('RMS of measured minus expected, over the noise')
-    figures.legend(figure, axes[0, 0])
-    if sizes:
-        _draw(axes[0, 1], sizes[::-1])
-    return figure
-
-
-def _draw(axis, sizes):
-    for k, (_, middle, low, high) in enumerate(sizes):
-        axis.plot([low, high], [k, k], color=figures.INK, lw=1.4)
-        axis.plot(middle, k, 'o', color=figures.AFTER, ms=4)
-    axis.axvline(0.0, color=figures.BEFORE, lw=0.9)
-    axis.set_yticks(np.arange(len(sizes)), [text for text, *_ in sizes])
-    axis.set_xlabel('deviation in typical sizes, 95 %')
-
-
-def _sizes(effects):
-    """Name, deviation and its interval of each number, over its typical deviation."""
-    result = []
-    for effect in effects:
-        for name, found in effect['parameters'].items():
-            values, file = np.atleast_1d(found['value']), np.atleast_1d(found['file'])
-            spans = np.reshape(found['interval'], (-1, 2))
-            for k, (value, own, span) in enumerate(zip(values, file, spans, strict=True)):
-                more = f' {"xyz"[k]}' if len(values) == 3 else ''
-                result.append((f'{label({**effect, "names": effect["names"][:1]})}\n{name}{more}',
-                               *((x - own) / found['typical'] for x in (value, *span))))
-    return result
-
-
-def _tolerances(result):
-    rows = [[name, f'{100 * e["deviation"]:.2f} %' if e['relative'] else f'{e["deviation"]:.2g}']
-            for name, e in result['tolerances'].items()]
-    return Grid('', ['number', 'deviation'], rows)
-
-
-def _damage(recording, damage):
-    """Figure of the readings of the damaged topic; a dashed line marks the onset."""
-    topic = damage['topic'] if damage['topic'] in LABELS else 'imu/data_raw'
-    t, values = recording.times[topic] - begin_of(recording), recording.values[topic]
-    figure, axes = figures.panels(len(LABELS[topic]), 1, height=1.1, sharex=True)
-    first = 0
-    for axis, (label_of, names) in zip(axes[:, 0], LABELS[topic].items(), strict=True):
-        for k, name in enumerate(names):
-            axis.plot(t, values[:, first + k], lw=0.8, color=figures.PARTS[k], label=name)
-        first += len(names)
-        axis.set_ylabel(label_of)
-        axis.legend(loc='upper right', ncols=4)
-        if damage['at_s'] is not None:
-            axis.axvline(damage['at_s'], color=figures.INK, ls='--', lw=1.0)
-    axes[-1, 0].set_xlabel('stamp [s], from the first IMU message on')
-    return figure

@@ -1,5 +1,5 @@
 """
-How well a solution explains flights: shares, discrepancies, errors, and what repeats unexplained.
+How well a solution explains flights: discrepancies, errors, and what repeats unexplained.
 
 Two tests look at the residual of forces and torques after the fit. They know nothing of causes.
 
@@ -29,6 +29,10 @@ SIZES = (0.001, 0.003, 0.01, 0.03, 0.1)     # amplitudes relative to hover thrus
 SLOWEST = 1.0                               # [Hz] of a line; slower ones are the flight's own path
 NEAR = 12                                   # frequencies on each side that a line is compared with
 
+LEAST_TIME = 1.0        # [s] in a regime, of which an RMS is stated
+UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate': 'rad/s',
+         'joint': 'rad'}
+
 
 def fitted(engine: Engine, solution: Solution, k: int) -> np.ndarray:
     """
@@ -46,26 +50,6 @@ def fitted(engine: Engine, solution: Solution, k: int) -> np.ndarray:
 def noise_of(found: Spectrum) -> np.ndarray:
     """(F, C) standard deviations of the noise of the coefficients."""
     return np.sqrt(np.diagonal(found.noise, axis1=1, axis2=2))[found.band]
-
-
-def explained(engine: Engine, solution: Solution, group: str) -> float:
-    """Share of the variance of a group's measurements that the fit predicts, by motion."""
-    own = [c for c, name in enumerate(engine.channels) if name.startswith(group)]
-    left = total = 0.0
-    for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
-        # without the generic discrepancy, which predicts what feedback leaves
-        x = fitted(engine, solution, k)
-        # a fit of feedback makes the robot heavier; the inertia is that of the file
-        x[[k for k, name in enumerate(engine.names) if name.startswith('inertia.')]] = 0.0
-        measured = spectrum(flight.linear({}, []).measured, np.zeros((*flight.mask.shape, 0)),
-                            flight.mask, flight.period, found.floor, flight.highest,
-                            engine.groups, engine.filters[k])
-        moving = found.band > 0
-        moving[found.counts[0]:] = False
-        rest, all_of_it = ((x / noise_of(found))[:, moving][:, :, own] for x in (
-            found.residual + found.slopes @ x, measured.residual))
-        left, total = left + (rest**2).sum(), total + (all_of_it**2).sum()
-    return 1 - left / total
 
 
 def discrepancy_sizes(engine: Engine, solution: Solution) -> list[float]:
@@ -122,6 +106,53 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
     return float(before), float(after), float(floor), closure
 
 
+def where_of(engine: Engine, solution: Solution) -> list[dict]:
+    """
+    Disagreement of the robot file by channel and regime of the flight, largest first.
+
+    ``excess``: RMS of the whitened residual over the noise; of a regime, in proportion to the
+    RMS there. Rows of the regime 'flight' are about all samples, with ``excess_after`` of the fit
+    without discrepancy, and ``rms``, ``rms_after`` and ``discrepancy_rms`` of what repeats and is
+    in no entry, with a unit.
+    """
+    known, whitened, raw = engine.known, [], []
+    for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
+        x = fitted(engine, solution, k)
+        whitened.append([(rest / noise_of(found)).reshape(-1, len(engine.channels))
+                         for rest in (found.residual, found.at(x))])
+        raw.append([np.where(flight.mask, flight.linear(at, []).residual, np.nan)
+                    for at in ({}, dict(zip(engine.names[:known], x, strict=False)))])
+    excess, rms = (np.sqrt([np.nanmean(np.concatenate(parts)**2, axis=0)
+                            for parts in zip(*own, strict=True)]) for own in (whitened, raw))
+    rows: list[dict] = [
+        {'channel': name, 'regime': 'flight', 'excess': float(excess[0, c]),
+         'excess_after': float(excess[1, c]), 'rms': float(rms[0, c]),
+         'rms_after': float(rms[1, c]), 'discrepancy_rms': discrepancy,
+         'unit': UNITS[name.partition('_')[0]]}
+        for c, (name, discrepancy) in enumerate(zip(
+            engine.channels, discrepancy_sizes(engine, solution), strict=True))]
+    before = np.concatenate([parts[0] for parts in raw])
+    regime = np.concatenate([regimes_of(flight.motion) for flight in engine.flights])
+    for c, name in enumerate(engine.channels):
+        for text in np.unique(regime):
+            there = before[regime == text, c]
+            there = there[np.isfinite(there)]
+            if len(there) * engine.flights[0].period >= LEAST_TIME:
+                rows.append({'channel': name, 'regime': str(text), 'excess': float(
+                    excess[0, c] * np.sqrt(np.mean(there**2)) / rms[0, c])})
+    return sorted(rows, key=lambda row: -row['excess'])
+
+
+def regimes_of(motion: dict[str, np.ndarray]) -> np.ndarray:
+    """(N,) regime of each sample: rotate, near ground, translate, tilted or hover."""
+    regime = np.full(len(motion['velocity']), 'hover', dtype=object)
+    regime[np.abs(motion['tilt']).max(axis=1) > 1.0] = 'tilted'
+    regime[np.linalg.norm(motion['velocity'], axis=1) > 0.4] = 'translate'
+    regime[motion['position'][:, 2] < 0.6] = 'near ground'
+    regime[np.linalg.norm(motion['rate'], axis=1) > 0.8] = 'rotate'
+    return regime
+
+
 @dataclass(frozen=True)
 class Unexplained:
     """
@@ -168,16 +199,20 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
     every = [features_of(flight.motion, flight.time, quick=True) for flight in flights]
     mean = np.concatenate(every).mean(axis=0)
     info, score = [], []
-    own = spectra[0].groups[0]
+    own = spectra[0].parts[0][0]
     for flight, found, rest, kernels, x in zip(flights, spectra, left, filters, every,
                                                strict=True):
         effect = acting(flight.robot, flight.motion, x - mean, channels)
         effect = effect.reshape(len(x), len(channels), -1)
         small = spectrum(np.zeros(effect.shape[:2]), effect, flight.mask, flight.period,
-                         found.floor, flight.highest, spectra[0].groups, kernels)
+                         found.floor, flight.highest, [own], kernels)
         count = found.counts[0]
         root = np.linalg.inv(np.linalg.cholesky(found.noise[-1][np.ix_(own, own)]))
-        a = (root @ small.slopes[:, :count][:, :, own]).reshape(len(rest), -1, effect.shape[2])
+        a = np.zeros((*small.residual.shape[:2], len(own), effect.shape[2]))
+        a[..., small.parts[0][1]] = small.parts[0][2]
+        for band, lost in found.hidden:
+            a[:, np.flatnonzero(small.band == band)[:, None], np.isin(own, lost)] = 0.0
+        a = (root @ a[:, :count]).reshape(len(rest), -1, effect.shape[2])
         b = (rest[:, :count][..., own] @ root.T).reshape(len(rest), -1)
         info.append(a.transpose(0, 2, 1) @ a)
         score.append((a.transpose(0, 2, 1) @ b[..., None])[..., 0])
@@ -196,8 +231,8 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
                        float(np.sum(gains)), tuple(channels[c] for c in own))
 
 
-def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, ...]
-         ) -> Unexplained:
+def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, ...],
+         own: list[int]) -> Unexplained:
     """
     Test of a periodic force or torque.
 
@@ -205,9 +240,9 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
         spectra: of the flights.
         left: (B, F, C) whitened residual of each flight after the fit.
         channels: names of all channels.
+        own: indices of those that are tested.
 
     """
-    own = spectra[0].groups[0]
     # blocks of flights differ in length, and so do their frequencies
     step = max(found.step for found in spectra)
     last = min((rest.shape[1] - 1) * found.step
@@ -234,13 +269,15 @@ def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
     """
     Both tests; the most improbable first.
 
-    Where an entry is excluded, the controller feeds noise back, and what repeats may be its
-    answer; nothing is tested then.
+    Where an entry is excluded, or noise hides the motion, the controller feeds noise back, and
+    what repeats may be its answer; nothing is tested there.
     """
-    if solution.banned:
+    own = [c for c in solution.spectra[0].parts[0][0]
+           if engine.channels[c].split('_')[0] not in engine.without_motion]
+    if solution.banned or not own:
         return []
-    left = [found.residual + found.slopes @ fitted(engine, solution, k)
+    left = [found.at(fitted(engine, solution, k))
             for k, found in enumerate(solution.spectra)]
     rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
-            line(solution.spectra, left, engine.channels)]
+            line(solution.spectra, left, engine.channels, own)]
     return sorted(rows, key=lambda row: row.probability)

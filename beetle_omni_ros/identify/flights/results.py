@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import compress
 from math import exp, log
 
 import numpy as np
@@ -13,14 +14,12 @@ from beetle_omni_ros.identify.flights.balance import Balance
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import log_prior, Posterior, Solution
 from beetle_omni_ros.identify.flights.keys import Entry, Key
-from beetle_omni_ros.identify.flights.page import summary
+from beetle_omni_ros.identify.flights.page import size_seen, summary, visible
 from beetle_omni_ros.identify.flights.quality import (
-    discrepancy_sizes,
     errors,
-    fitted,
-    noise_of,
     Unexplained,
     unexplained,
+    where_of,
 )
 from beetle_omni_ros.identify.flights.treatment import separating_experiment, TREATMENTS
 from beetle_omni_ros.model.effects import CATALOGUE
@@ -28,12 +27,11 @@ from beetle_omni_ros.model.effects import CATALOGUE
 ALPHA = 0.05            # probability of a false alarm that is accepted
 CROWD = 4               # members of a set from which the flights do not decide
 NAMING = 'named', 'named_set'
+WIDEST = 9.0            # typical deviations of the widest prior of an entry
 TESTS = 2               # of what is unexplained; they share the accepted probability
 MOST_FED_BACK = 2       # entries that feedback may exclude; with more, the loop hides the robot
 FORM_DEVIATION = 0.1    # of a value: deviation by the error of form of its law
-LEAST_TIME = 1.0        # [s] in a regime, of which an RMS is stated
-UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate': 'rad/s',
-         'joint': 'rad'}
+STILL = 'noise hides the motion, so that only means are compared'
 Starts = dict[str, dict[str, float]]
 
 
@@ -45,7 +43,8 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
 
     Args:
         verdict: a key of :data:`~beetle_omni_ros.identify.flights.page.WORDS`.
-        groups: each group of channels: ``used``, ``channels``, and ``reason`` if not.
+        groups: each group of channels: ``used``, ``channels``, and ``reason`` if not, or
+            if only a part is.
         reason: why no effect is named, as the end of a sentence.
         more: further keys, and those that have another value than that of bad data.
 
@@ -97,23 +96,28 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
     chance = exp(min(0.0, -e_value))
     found = [(e, s, own, k, members) for e, s, own in tests if chance <= alpha
              for k, members in named_of(e, s, alpha)]
+    effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]
+    weak = [effect for effect, (e, *_) in zip(effects, found, strict=True) if e is slow]
+    keep = [one[0] is slow or not of_a_rotor(effect, weak)
+            for one, effect in zip(found, effects, strict=True)]
+    found, effects = list(compress(found, keep)), list(compress(effects, keep))
     taken = [[k for e, _, _, k, _ in found if e is test[0]] for test in tests]
     sets = [list(dict.fromkeys(s.entries[j].label if e is slow else s.entries[j].name
                                for j in members)) for e, s, _, _, members in found]
-    rows = [candidates_of(s, own) for (_, s, _), own in zip(tests, taken, strict=True)]
+    rows = [row for (e, s, own), named in zip(tests, taken, strict=True) for row in candidates_of(
+        e, s, own, named, starts or {}, alpha / len(tests))]
     rest = unexplained(engine, solution) if measured else []
     fed_back = sorted(solution.entries[k].name.replace('_', ' ') for k in solution.banned)
     verdict, reason = verdict_of(chance, sets, rest, fed_back, alpha)
-    effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]
     return result_of(
-        verdict, groups, reason,
+        verdict, {**groups, **{kind: groups[kind] | {'reason': STILL}
+                               for kind in engine.without_motion}}, reason,
         effects=[effect for effect, members in zip(effects, sets, strict=True)
                  if verdict in NAMING and len(members) < CROWD],
         partial=[effect for effect, members in zip(effects, sets, strict=True)
                  if verdict not in NAMING or len(members) >= CROWD],
-        candidates=sorted((row for own in rows for row in own), key=_rank, reverse=True),
-        hidden=[name for (_, s, _), own in zip(tests, rows, strict=True)
-                for name in hidden_of(own, len(s.entries), alpha / len(tests))],
+        candidates=sorted(rows, key=_rank, reverse=True),
+        hidden=[row['name'] for row in visible(rows) if size_seen(row) > 1],
         where=where_of(engine, solution), false_alarm_probability=chance,
         held_out=held_out, findings=[*findings, *varied(engine, solution), *(
             test.sentence[:1].upper() + test.sentence[1:] for test in rest
@@ -162,12 +166,29 @@ def effect_of(solution: Solution, engine: Engine, keys: dict[str, Key], k: int,
         'names': list(dict.fromkeys(solution.entries[j].name for j in members)),
         'members': list(dict.fromkeys(solution.entries[j].label for j in members)),
         'parameters': sizes(k), 'layer': CATALOGUE[entry.name].layer, **member_of(entry),
-        'evidence': {'ln_bayes_factor': gain, 'delta_bic': 2 * gain,
-                     'constancy': -solution.unsteady.get(k, 0.0)}}
+        'evidence': _evidence(gain)}
     if rivals := [{'name': solution.entries[j].name, **member_of(solution.entries[j]),
                    'parameters': sizes(j)} for j in members[1:]]:
         result['rivals'] = rivals
     return result
+
+
+def of_a_rotor(effect: dict, slow: list[dict]) -> bool:
+    """
+    Whether the forces show all rotors as weak because one is.
+
+    Args:
+        effect: named by the forces.
+        slow: effects that the balance of torques names.
+
+    """
+    thrust, = [one['parameters']['scale'] for one in [effect, *effect.get('rivals', [])]
+               if 'thrust_coefficient' in (one.get('name'), one.get('names', [''])[0])] or [None]
+    rotors = [one['parameters']['scale'] for each in slow for one in [
+        each, *each.get('rivals', [])] if 'rotor' in one]
+    return thrust is not None and any(
+        thrust['interval'][0] <= thrust['file'] * (3 + rotor['value'] / rotor['file']) / 4
+        <= thrust['interval'][1] for rotor in rotors)
 
 
 def member_of(entry: Entry) -> dict[str, int]:
@@ -211,9 +232,9 @@ def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Poster
             spans.append([max(key.value(middle - half), min(spec.low, values[-1])),
                           min(key.value(middle + half), max(spec.high, values[-1]))])
         if own:
-            base, key = [keys[name].base for name in own], keys[own[0]]
-            one, row = len(own) == 1, np.abs(rows[own[0]])
-            typical = float((row * engine.typical[index]).max())
+            base, key, one = [keys[name].base for name in own], keys[own[0]], len(own) == 1
+            typical = float(engine.typical[engine.index[own[0]]]) if own[0] in engine.index \
+                else key.typical
             found[parameter] = {'value': values[0] if one else values, 'unit': spec.unit,
                                 'interval': spans[0] if one else spans,
                                 'file': base[0] if one else base,
@@ -221,28 +242,31 @@ def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Poster
     return found
 
 
-def candidates_of(solution: Solution, taken: Sequence[int]) -> list[dict]:
+def candidates_of(engine: Engine, solution: Solution, keys: dict[str, Key], taken: Sequence[int],
+                  starts: Starts, alpha: float) -> list[dict]:
     """
-    Evidence of each entry alone, the largest first.
+    Evidence of each entry alone.
 
-    Of the starts of one entry, the one with most evidence counts. ``expected_ln_bayes_factor`` is
-    the evidence that a typical size would have in these flights.
+    Of the starts of one entry, the one with most evidence counts. ``seen_from`` is the size that
+    would be named in the mean; of several starts, the smallest one.
     """
+    count = len(solution.entries)
+    least = log(1 / alpha) + log_prior(0, count) - log_prior(1, count)
     rows: dict[tuple, dict] = {}
     for k, entry in enumerate(solution.entries):
         if entry.varying:
             continue
         gain = solution.gains.get((k,))
-        index = [solution.names.index(key) for key in entry.keys]
         row = {'name': entry.name, **member_of(entry), 'accepted': k in taken,
                'reason': 'value differs between frequencies' if k in solution.banned else '',
-               'evidence': {'ln_bayes_factor': gain,
-                            'delta_bic': None if gain is None else 2 * gain},
-               'expected_ln_bayes_factor': solution.judge.expected(index)}
+               'evidence': _evidence(gain),
+               'seen_from': seen_from(engine, solution, keys, entry, starts, least)}
         other = rows.get((entry.name, entry.member))
-        if other is None or _rank(row) > _rank(other):
-            rows[entry.name, entry.member] = row
-    return sorted(rows.values(), key=_rank, reverse=True)
+        if other:
+            row = max(other, row, key=_rank) | {
+                'seen_from': min(other, row, key=size_seen)['seen_from']}
+        rows[entry.name, entry.member] = row
+    return list(rows.values())
 
 
 def _rank(row):
@@ -250,64 +274,31 @@ def _rank(row):
     return row['accepted'], -np.inf if gain is None else gain
 
 
-def hidden_of(rows: list[dict], count: int, alpha: float) -> list[str]:
+def _evidence(gain):
+    return {'ln_bayes_factor': gain, 'delta_bic': None if gain is None else 2 * gain}
+
+
+def seen_from(engine: Engine, solution: Solution, keys: dict[str, Key], entry: Entry,
+              starts: Starts, evidence: float) -> dict:
     """
-    Entries that would not be named at their typical size: their mean evidence is too small.
+    Size of an entry's first number with this mean ``evidence``, its typical size, and the unit.
 
-    ``rows``: of :func:`candidates_of`; ``count``: number of entries.
+    The unit is % for a share of the robot file. The size of a limit is that of its start. A size
+    is None beyond the start, where a secant is not valid, and beyond the widest prior.
     """
-    best: dict[str, float] = {}
-    for row in sorted(rows, key=lambda row: _rank(row)[1], reverse=True):
-        best[row['name']] = max(best.get(row['name'], -np.inf), row['expected_ln_bayes_factor'])
-    least = log(1 / alpha) + log_prior(0, count) - log_prior(1, count)
-    return [name for name, evidence in best.items() if evidence < least]
-
-
-def where_of(engine: Engine, solution: Solution) -> list[dict]:
-    """
-    Disagreement of the robot file by channel and regime of the flight, largest first.
-
-    ``excess``: RMS of the whitened residual over the noise; of a regime, in proportion to the
-    RMS there. Rows of the regime 'flight' are about all samples, with ``excess_after`` of the fit
-    without discrepancy, and ``rms``, ``rms_after`` and ``discrepancy_rms`` of what repeats and is
-    in no entry, with a unit.
-    """
-    known, whitened, raw = engine.known, [], []
-    for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
-        x = fitted(engine, solution, k)
-        whitened.append([(rest / noise_of(found)).reshape(-1, len(engine.channels))
-                         for rest in (found.residual, found.residual + found.slopes @ x)])
-        raw.append([np.where(flight.mask, flight.linear(at, []).residual, np.nan)
-                    for at in ({}, dict(zip(engine.names[:known], x, strict=False)))])
-    excess, rms = (np.sqrt([np.nanmean(np.concatenate(parts)**2, axis=0)
-                            for parts in zip(*own, strict=True)]) for own in (whitened, raw))
-    rows: list[dict] = [
-        {'channel': name, 'regime': 'flight', 'excess': float(excess[0, c]),
-         'excess_after': float(excess[1, c]), 'rms': float(rms[0, c]),
-         'rms_after': float(rms[1, c]), 'discrepancy_rms': discrepancy,
-         'unit': UNITS[name.partition('_')[0]]}
-        for c, (name, discrepancy) in enumerate(zip(
-            engine.channels, discrepancy_sizes(engine, solution), strict=True))]
-    before = np.concatenate([parts[0] for parts in raw])
-    regime = np.concatenate([regimes_of(flight.motion) for flight in engine.flights])
-    for c, name in enumerate(engine.channels):
-        for text in np.unique(regime):
-            there = before[regime == text, c]
-            there = there[np.isfinite(there)]
-            if len(there) * engine.flights[0].period >= LEAST_TIME:
-                rows.append({'channel': name, 'regime': str(text), 'excess': float(
-                    excess[0, c] * np.sqrt(np.mean(there**2)) / rms[0, c])})
-    return sorted(rows, key=lambda row: -row['excess'])
-
-
-def regimes_of(motion: dict[str, np.ndarray]) -> np.ndarray:
-    """(N,) regime of each sample: rotate, near ground, translate, tilted or hover."""
-    regime = np.full(len(motion['velocity']), 'hover', dtype=object)
-    regime[np.abs(motion['tilt']).max(axis=1) > 1.0] = 'tilted'
-    regime[np.linalg.norm(motion['velocity'], axis=1) > 0.4] = 'translate'
-    regime[motion['position'][:, 2] < 0.6] = 'near ground'
-    regime[np.linalg.norm(motion['rate'], axis=1) > 0.8] = 'rotate'
-    return regime
+    name = entry.keys[0]
+    size = solution.judge.least([engine.index[key] for key in entry.keys], evidence)
+    own, part = next(iter(starts[name].items())) if name in starts else (
+        name, float(engine.typical[engine.index[name]]))
+    key, known = keys[own], size <= (1 if name in starts else WIDEST)
+    unit = CATALOGUE[entry.name].parameters[key.parameter].unit
+    if not key.relative:
+        return {'value': size * part if known else None, 'unit': unit,
+                'typical': key.typical if name in starts else part}
+    if name in starts:
+        return {'value': key.value(part) if known else None, 'unit': unit, 'typical': None}
+    return {'value': 100 * float(np.expm1(size * part)) if known else None, 'unit': '%',
+            'typical': 100 * float(np.expm1(part))}
 
 
 def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: list) -> dict:

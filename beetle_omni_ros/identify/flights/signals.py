@@ -31,6 +31,9 @@ FINE = 0.005            # [s] grid on which measurements are smoothed
 # The IMU's clock is the reference: its delay shifts all other signals. Shifting the IMU itself
 # would resample its noise, which changes chi2 by more than a delay does.
 IMU_LAG = 'imu_filter_lag.delay'
+# Keys that change thrusts after their delay.
+LAGS = ('rotor_lag.time_constant', 'thrust_saturation.thrust_max',
+        *(f'rotor.lag[{k}]' for k in range(4)))
 
 
 class Signals:
@@ -218,15 +221,19 @@ class Signals:
                 thrust + common + theta.get(THRUST_BUS, 0.0)
                 + theta.get('rotor_dead_time.delay', 0.0))
 
+    def smooth_thrust(self, theta):
+        """The thrusts and rates, smoothed as the IMU's readings."""
+        kernel = low_pass(self.p.smooth_imu, 1, self.p.grid)
+        return self._cached(('smooth', self.delays(theta)[1]), theta, LAGS, lambda: [
+            within(kernel, series, 0) for series in self.thrust(theta)])
+
     def thrust(self, theta):
         """Thrusts after delay, limits and lag [N], and their rates of change (N, 4)."""
-        names = ['rotor_lag.time_constant', 'thrust_saturation.thrust_max',
-                 *(f'rotor.lag[{k}]' for k in range(4))]
-        lag, limit, *own = (theta.get(name, 0.0) for name in names)
+        lag, limit, *own = (theta.get(name, 0.0) for name in LAGS)
         delay = self.delays(theta)[1]
 
         def make():
-            mean = self._cached(('commands', delay), theta, names[1:2],
+            mean = self._cached(('commands', delay), theta, LAGS[1:2],
                                 lambda: self._mean_commands(delay, limit))
             tau = self.robot.rotors.time_constant * np.exp(lag + np.array(own))
             keep = np.exp(-self._step / tau)
@@ -235,7 +242,7 @@ class Signals:
             places = np.rint((self.t - self._begin) / self._step).astype(int) - 1
             force = lagged[places]
             return force, (mean[places + 1] - force) / tau
-        return self._cached(('thrust', delay), theta, names, make)
+        return self._cached(('thrust', delay), theta, LAGS, make)
 
     def _mean_commands(self, delay, limit):
         """Mean thrust commands (K, 4) between the steps of the rotor filter [N]."""

@@ -10,7 +10,8 @@ follow from it. The filtered coefficients of all bands then share one covariance
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import dct
@@ -22,6 +23,7 @@ EDGES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 25.0)
 MANY = 4            # times as many coefficients as keys: the variance of the fit is negligible
 WARM = 0.5          # [s] after a gap of this length that do not count
 TAPS = 1.0          # [s] length of a whitening filter
+NONE = np.zeros(0, dtype=int)
 LEAST = 0.25         # share of a block that must count
 
 
@@ -49,45 +51,96 @@ class Spectrum:
 
     Attributes:
         residual: (B, F, C) coefficients of the residual in B blocks at F frequencies.
-        slopes: (B, F, C, K) those of the slopes.
+        parts: groups of channels with common noise: their indices (c,), the keys (k,) that act on
+            them, and slopes (B, F, c, k) by these.
+        keys: number of all keys.
         band: (F,) band of each frequency.
         noise: (bands, C, C) covariance of the coefficients of each band.
         floor: (C,) smallest standard deviation of a sample's noise.
-        groups: indices of the channels with common noise.
         counts: number of frequencies that count, of each group.
         step: between frequencies, the first of which is zero [Hz].
+        level: whether all bands have the same noise.
+        hidden: bands and channels that do not count, because noise hides the motion.
 
     """
 
     residual: np.ndarray
-    slopes: np.ndarray
+    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    keys: int
     band: np.ndarray
     noise: np.ndarray
     floor: np.ndarray
-    groups: list[np.ndarray]
     counts: list[int]
     step: float
     level: bool = False
-    _kept: tuple | None = None
-    _parts: list = field(default_factory=list)
+    hidden: Sequence[tuple[int, list[int]]] = ()
 
-    def grams(self) -> tuple[np.ndarray, np.ndarray]:
+    def at(self, x: np.ndarray) -> np.ndarray:
+        """(B, F, C) coefficients of the residual at deviations ``x`` (K,)."""
+        result = self.residual.copy()
+        for channels, keys, slopes in self.parts:
+            result[..., channels] += slopes @ x[keys]
+        return result
+
+    def joined(self, copies: list[tuple[int, int, list[int]]], other: Spectrum, count: int
+               ) -> Spectrum:
         """
-        Normal equations of each block and band.
+        This one with further keys.
+
+        Args:
+            copies: index of a key, that of the key that it acts as, and on which channels.
+            other: spectrum of the same flight.
+            count: index at which the keys of ``other`` begin.
+
+        """
+        parts = []
+        for (channels, keys, slopes), (_, more, further) in zip(
+                self.parts, other.parts, strict=True):
+            own = [(k, slopes[..., keys == key] * np.isin(channels, rows)[:, None])
+                   for k, key, rows in copies if key in keys]
+            parts.append((channels, np.concatenate([
+                keys, np.array([k for k, _ in own], dtype=int), count + more]), np.concatenate(
+                [slopes, *(part for _, part in own), further], axis=3)))
+        return replace(self, parts=parts, keys=count + other.keys)
+
+    def grams(self, groups: np.ndarray = NONE) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Normal equations of each block and group of bands.
+
+        Args:
+            groups: (bands,) group of each band, from 0, ascending; none: all are one group.
 
         Returns:
-            (B, bands, K, K) information and (B, bands, K) right sides, so that the least squares
+            (B, groups, K, K) information and (B, groups, K) right sides, so that the least squares
             solution is information^-1 right.
 
         """
-        if self._kept is None:
-            self._kept = self._grams()
-        return self._kept
+        blocks, copies = len(self.residual), int(groups.max(initial=0)) + 1
+        info = np.zeros((blocks, copies, self.keys, self.keys))
+        right = np.zeros((blocks, copies, self.keys))
+        for (channels, keys, slopes), most in zip(self.parts, self.counts, strict=True):
+            s, r = np.zeros((blocks, most, *slopes.shape[2:])), np.zeros(
+                (blocks, most, len(channels)))
+            for k, own in enumerate(self._bands(most)):
+                lost = [c for band, hidden in self.hidden if band == k for c in hidden]
+                seen = np.flatnonzero(~np.isin(channels, lost))
+                noise = self.noise[k][np.ix_(channels[seen], channels[seen])]
+                root = np.linalg.inv(np.linalg.cholesky(noise))
+                s[:, own][:, :, seen] = root @ slopes[:, own][:, :, seen]
+                r[:, own][..., seen] = self.residual[:, own][..., channels[seen]] @ root.T
+            edges = np.searchsorted(groups[self.band[:most]] if len(groups) else np.zeros(most),
+                                    np.arange(copies + 1))
+            for block in range(blocks):
+                for group, (low, high) in enumerate(zip(edges, edges[1:], strict=False)):
+                    rows = s[block, low:high].reshape((high - low) * len(channels), len(keys))
+                    info[block, group, keys[:, None], keys] += rows.T @ rows
+                    right[block, group, keys] -= rows.T @ r[block, low:high].ravel()
+        return info, right
 
     def power(self) -> float:
         """Sum of squares of the whitened residual."""
         total = 0.0
-        for channels, count in zip(self.groups, self.counts, strict=True):
+        for (channels, _, _), count in zip(self.parts, self.counts, strict=True):
             own = self.residual[:, :count][..., channels]
             inverse = np.linalg.inv(self.noise[:, channels[:, None], channels])
             total += np.einsum('bfc,fcd,bfd->', own, inverse[self.band[:count]], own)
@@ -96,39 +149,13 @@ class Spectrum:
     @property
     def size(self) -> int:
         """Number of coefficients that count."""
-        return len(self.residual) * sum(count * len(channels) for channels, count in zip(
-            self.groups, self.counts, strict=True))
+        return len(self.residual) * sum(count * len(part[0]) for part, count in zip(
+            self.parts, self.counts, strict=True))
 
     def _bands(self, count):
         """Range of frequencies of each band, of the first ``count`` frequencies."""
         edges = np.minimum(np.searchsorted(self.band, np.arange(len(self.noise) + 1)), count)
         return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
-
-    def _grams(self):
-        blocks, _, _, count = self.slopes.shape
-        bands = len(self.noise)
-        info, right = np.zeros((blocks, bands, count, count)), np.zeros((blocks, bands, count))
-        for (channels, keys, slopes), most in zip(self.parts, self.counts, strict=True):
-            for k, own in enumerate(self._bands(most)):
-                noise = self.noise[k][np.ix_(channels, channels)]
-                root = np.linalg.inv(np.linalg.cholesky(noise))
-                s = root @ slopes[:, own]
-                r = self.residual[:, own][..., channels] @ root.T
-                rows = s.shape[1] * s.shape[2]
-                s, r = s.reshape(blocks, rows, len(keys)), r.reshape(blocks, rows)
-                info[:, k, keys[:, None], keys] += s.transpose(0, 2, 1) @ s
-                right[:, k, keys] -= (s.transpose(0, 2, 1) @ r[..., None])[..., 0]
-        return info, right
-
-    @property
-    def parts(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Groups of channels with common noise, keys that act on them, and slopes by these."""
-        if not self._parts:
-            for channels in self.groups:
-                own = self.slopes[:, :, channels]
-                keys = np.flatnonzero(np.abs(own).max(axis=(0, 1, 2)) > 0)
-                self._parts.append((channels, keys, np.ascontiguousarray(own[..., keys])))
-        return self._parts
 
     def learn(self, x: np.ndarray, covariance: np.ndarray, prior: np.ndarray,
               weight: float) -> None:
@@ -142,7 +169,6 @@ class Spectrum:
             weight: number of coefficients as which this prior counts.
 
         """
-        self._kept = None
         for (channels, keys, slopes), most in zip(self.parts, self.counts, strict=True):
             of_keys = covariance[np.ix_(keys, keys)]
             totals, counts = [], []
@@ -184,7 +210,7 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
 
     Args:
         residual: (N, C) measured minus expected.
-        slopes: (N, C, K) its derivatives; whitened in place, because a copy is 100 MB.
+        slopes: (N, C, K) its derivatives.
         mask: (N, C) samples that count.
         period: of the samples [s].
         floor: (C,) smallest standard deviation of a sample's noise.
@@ -193,56 +219,60 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
         filters: (C, L) whitening filters; None: the noise differs between bands.
 
     """
-    if filters is not None:
-        residual, slopes, mask = _whitened(residual, slopes, mask, filters, int(WARM / period))
-    rows = blocks_of(mask, period)
-    weight, size = mask[rows], rows.shape[1]
+    weight = mask if filters is None else np.stack(
+        [_known(own, int(WARM / period)) for own in mask.T], axis=1)
+    rows = blocks_of(weight, period)
+    weight, size = weight[rows], rows.shape[1]
     frequency = np.arange(size) / (2 * size * period)
     highest = np.broadcast_to(highest, len(floor))
     used = frequency <= min(EDGES[-1], highest.max())
-    coefficients = dct(residual[rows] * weight, axis=1, norm='ortho')[:, used]
-    derivatives = np.zeros((len(rows), int(used.sum()), *slopes.shape[1:]))
-    for c, acting in enumerate((slopes != 0).any(axis=0)):
-        own = np.flatnonzero(acting)        # most keys act on few channels
-        derivatives[:, :, c, own] = dct(
-            slopes[:, c, own][rows] * weight[:, :, c, None], axis=1, norm='ortho')[:, used]
+    coefficients = np.zeros((len(rows), int(used.sum()), len(floor)))
+    parts = []
+    for channels in groups:
+        keys = np.flatnonzero((slopes[:, channels] != 0).any(axis=(0, 1)))
+        made = np.zeros((*coefficients.shape[:2], len(channels), len(keys)))
+        for k, c in enumerate(channels):
+            own = np.flatnonzero((slopes[:, c, keys] != 0).any(axis=0))  # most act on few channels
+            both = np.column_stack([residual[:, c], slopes[:, c, keys[own]]])
+            if filters is not None:
+                both = _whitened(both, np.flatnonzero(mask[:, c]), filters[c])
+            both = dct(both[rows] * weight[:, :, c, None], axis=1, norm='ortho')[:, used]
+            coefficients[:, :, c], made[:, :, k, own] = both[..., 0], both[..., 1:]
+        parts.append((channels, keys, made))
     band = np.searchsorted(EDGES, frequency[used], side='left')
     noise = np.tile(np.diag(floor.astype(float)**2), (len(EDGES), 1, 1))
     for k in np.unique(band):
-        own = coefficients[:, band == k].reshape(-1, coefficients.shape[2])
-        noise[k] += np.diag((own**2).mean(axis=0))
+        there = coefficients[:, band == k].reshape(-1, coefficients.shape[2])
+        noise[k] += np.diag((there**2).mean(axis=0))
     counts = [int((frequency[used] <= highest[channels[0]]).sum()) for channels in groups]
-    return Spectrum(coefficients, derivatives, band, noise, floor, groups, counts,
+    return Spectrum(coefficients, parts, slopes.shape[2], band, noise, floor, counts,
                     0.5 / (size * period), filters is not None)
 
 
-def _whitened(residual, slopes, mask, filters, warm):
-    """
-    Filtered residual and slopes, and what counts of them.
+def _known(mask, warm):
+    """(N,) samples that count of a filtered channel: not those after the begin or a long gap."""
+    there = np.flatnonzero(mask)
+    gap = np.convolve(~mask, np.ones(warm))[:len(mask)] >= warm
+    lost = np.convolve(gap, np.ones(warm + 1))[:len(mask)] > 0
+    lost[:there[0] + warm if len(there) else None] = True
+    return mask & ~lost
 
-    Missing samples are interpolated in both, so that the linear model stays exact. What follows
-    the begin or a long gap does not count.
+
+def _whitened(series, there, kernel):
     """
-    residual, mask = residual.copy(), mask.copy()
-    t = np.arange(len(mask))
-    for c in range(mask.shape[1]):
-        there = np.flatnonzero(mask[:, c])
-        if not len(there):
-            continue
-        right = np.clip(np.searchsorted(there, t), 0, len(there) - 1)
-        left = np.clip(np.searchsorted(there, t, side='right') - 1, 0, None)
-        left, right = there[left], there[right]
-        part = np.clip((t - left) / np.maximum(right - left, 1), 0, 1)
-        used = np.flatnonzero(np.abs(slopes[:, c]).max(axis=0) > 0)
-        both = np.column_stack([residual[:, c], slopes[:, c, used]])
-        both = both[left] + part[:, None] * (both[right] - both[left])
-        both = fftconvolve(both, filters[c][:, None], axes=0)[:len(t)]
-        residual[:, c], slopes[:, c, used] = both[:, 0], both[:, 1:]
-        gap = np.convolve(~mask[:, c], np.ones(warm))[:len(t)] >= warm
-        lost = np.convolve(gap, np.ones(warm + 1))[:len(t)] > 0
-        lost[:there[0] + warm] = True
-        mask[:, c] &= ~lost
-    return residual, slopes, mask
+    Series (N, n) of one channel, filtered; samples that are not ``there`` are interpolated.
+
+    Residual and slopes are treated alike, so that the linear model stays exact.
+    """
+    if not len(there):
+        return series
+    t = np.arange(len(series))
+    right = np.clip(np.searchsorted(there, t), 0, len(there) - 1)
+    left = np.clip(np.searchsorted(there, t, side='right') - 1, 0, None)
+    left, right = there[left], there[right]
+    part = np.clip((t - left) / np.maximum(right - left, 1), 0, 1)
+    series = series[left] + part[:, None] * (series[right] - series[left])
+    return fftconvolve(series, kernel[:, None], axes=0)[:len(t)]
 
 
 def whitening(power: np.ndarray, period: float) -> np.ndarray:

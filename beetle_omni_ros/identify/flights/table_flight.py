@@ -59,6 +59,8 @@ class TableFlight:
         channels: names of the channels that can be formed.
         mask: (N, C) samples that count.
         reasons: channel -> why it is not used; '' if it is used.
+        motion: velocity (world), quaternion, position, tilts and rates of the samples.
+        time: (N,) times of the samples [s].
         apart: why IMU and MoCap of this flight are not compared although both are there, or ''.
 
     """
@@ -75,10 +77,10 @@ class TableFlight:
         """Form the inputs, the measurements and the mask."""
         table, n = self.table, len(self.table)
         self.name, self.period = table.name, table.period
-        self._t = np.arange(n) * self.period
+        self.time = np.arange(n) * self.period
         self.highest = _highest(table.format.clock_deviation)
         self._command, known = self._commands()
-        self._inputs, measured, reasons = self._states()
+        self.motion, measured, reasons = self._states()
         self._seen, felt, more = self._compared()
         measured, reasons = np.concatenate([measured, felt], axis=1), [*reasons, *more]
         chosen = [k for k, why in enumerate(reasons) if not why]
@@ -152,7 +154,7 @@ class TableFlight:
 
     def _compared(self):
         """(N, 6) specific force and rate by MoCap, the same by the IMU, and why one lacks."""
-        v, inputs, n = self.table.values, self._inputs, len(self._t)
+        v, inputs, n = self.table.values, self.motion, len(self.time)
         reasons = [next((f'no {NEEDED[s]}' for s in need if s not in v), '') for need in (
             ('position', 'quaternion', 'specific_force'), ('quaternion', 'angular_velocity'))]
         limit = _highest(self._wander)
@@ -177,7 +179,7 @@ class TableFlight:
 
     def _flying(self):
         """(N,) whether the robot is in the air."""
-        position = self._inputs['position']
+        position = self.motion['position']
         high = 'position' not in self.table.values or (
             position[:, 2] > position[:10, 2].mean() + AIRBORNE)
         lifted = self._thrust({})[0].sum(axis=1) > 0.5 * self.robot.mass * self.robot.gravity
@@ -198,7 +200,8 @@ class TableFlight:
         h = self.period
         tau = rotors.time_constant * np.exp(theta.get('rotor_lag.time_constant', 0.0))
         if delay:
-            command = np.stack([np.interp(self._t - delay, self._t, c) for c in command.T], axis=1)
+            t = self.time
+            command = np.stack([np.interp(t - delay, t, c) for c in command.T], axis=1)
         keep, ramp = np.exp(-h / tau), (1 - np.exp(-h / tau)) * tau / h
         # exact for commands that are linear between samples; begins settled
         lagged = lfilter([1 - ramp, ramp - keep], [1, -keep], command, axis=0,
@@ -220,7 +223,7 @@ class TableFlight:
 
     def _at(self, theta):
         thrust, thrust_rate = self._thrust(theta)
-        inputs = {**self._inputs, 'thrust': thrust, 'thrust_rate': thrust_rate}
+        inputs = {**self.motion, 'thrust': thrust, 'thrust_rate': thrust_rate}
         if 'duty' in self.table.values:     # the voltage acts in the motor map
             theta = {**theta, 'voltage_sag.exponent': -self.robot.effect(
                 'voltage_sag.exponent', 0.0)}
@@ -274,22 +277,12 @@ class TableFlight:
         if 'angular_velocity' in there or len(blocks) < 2 or not (
                 there & {'quaternion', 'acceleration'} and there & {'position', 'velocity'}):
             return None
-        turned = rising(turning(self._inputs['quaternion'], self.period), self.period)
+        turned = rising(turning(self.motion['quaternion'], self.period), self.period)
         inputs, at = self._at({})
         left = turned - self.body(inputs, at)[:, 3:]
         slopes = self.body.derivatives(inputs, at, tuple(names))
         return (np.array([left[block, :2].mean(axis=0) for block in blocks]),
                 np.array([slopes[block, 3:5].mean(axis=0) for block in blocks]))
-
-    @property
-    def motion(self) -> dict[str, np.ndarray]:
-        """Velocity (world), quaternion, position and tilts of the samples."""
-        return self._inputs
-
-    @property
-    def time(self) -> np.ndarray:
-        """(N,) times of the samples [s]."""
-        return self._t
 
     def settle(self, theta: dict[str, float]) -> None:
         """Choose inputs that depend on deviations; a table has none."""

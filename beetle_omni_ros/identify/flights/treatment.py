@@ -138,7 +138,7 @@ TREATMENTS: dict[str, Treatment] = {
         ('joint_command_latency', 'joint_torque_limit'),
         'sine sweep of the tilts 0.5 to 6 Hz with two amplitudes', 'J'),
     'joint_velocity_limit': Treatment(
-        {'velocity_limit': Size(0.5, 0.05, step=0.01)}, 'large tilt steps',
+        {'velocity_limit': Size(0.5, 0.05, 'speed', step=0.01)}, 'large tilt steps',
         ('joint_torque_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg', 'J',
         starts=((0.95,), (0.8,)), limit=('tilt_rate', 0.95)),
     'joint_torque_limit': Treatment(
@@ -171,7 +171,7 @@ TREATMENTS: dict[str, Treatment] = {
     'imu_filter_lag': Treatment(
         {'delay': Size(0.01, 0.002, 'delay')}, 'fast turns',
         ('mocap_time_offset', 'rotor_dead_time'),
-        'turns above 1 rad/s with thrust steps; log the raw gyroscope', 'BAWJ'),
+        'turns above 1 rad/s with thrust steps; log the raw gyroscope', 'BAW'),
     'imu_accelerometer_bias': Treatment(
         {'bias': Size(0.15, 0.03, 'bias_accelerometer')}, 'several attitudes',
         ('wind', 'imu_misalignment', 'joint_offset'),

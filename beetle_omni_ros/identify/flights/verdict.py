@@ -27,7 +27,6 @@ from beetle_omni_ros.identify.flights.keys import (
     tolerances,
     VARYING,
 )
-from beetle_omni_ros.identify.flights.quality import explained
 from beetle_omni_ros.identify.flights.results import ALPHA, concluded, result_of, Starts
 from beetle_omni_ros.identify.flights.signals import IMU_LAG
 from beetle_omni_ros.identify.flights.table_flight import COMPARED, GROUPS, TableFlight
@@ -50,9 +49,8 @@ FORCES = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_dra
           'formula')
 TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coefficient',
            'rotor_hub_moment', 'propeller_gyroscopic_torque', 'rotor_acceleration_torque')
-EXPLAINED = 0.5         # share of the angular acceleration: below, errors exceed what is explained
-FEEDBACK = ('the commands explain less than half of the angular acceleration: a controller that '
-            'feeds back what the model lacks would be taken for the robot')
+FEEDBACK = ('the commands explain too little of the angular acceleration: a controller that feeds '
+            'back what the model lacks would be taken for the robot')
 WEIGHED = 'mass', 'inertia'
 LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
 # Entries of the comparison of IMU and MoCap.
@@ -79,8 +77,9 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     priors, entries, bounds, far = _priors(robot, {
         n: key for n, key in keys.items() if key.effect in CATALOGUE and not key.form
         and key.effect not in {*LIMITS, *p.without}}, tolerance)
-    priors |= {n: Prior(tolerance[n], key.typical, 0.0) for n, key in extra_keys().items()
-                if n != 'modules.share' or robot.multibody is not None}
+    priors |= {n: Prior(tolerance[n], key.typical, 0.0) for n, key in keys.items()
+               if n in tolerance and n not in priors and key.effect not in p.without
+               and (n != 'modules.share' or robot.multibody is not None)}
     for start, own in starts.items():
         name, moved = start.partition('@')[0], [f'{start}~{key}' for key in own]
         priors[start] = Prior(0.03, 1.0, 0.0)
@@ -163,7 +162,7 @@ def _delays(robot, p, coarse):
     return deviations, limits
 
 
-def _engine(flights, robot, p, declared, alpha, progress):
+def _engine(flights, robot, p, declared, alpha):
     """Engine of flights of tables with the entries that channels and signals can show."""
     channels, signals, names = flights[0].channels, set(declared.signals), set(FORCES)
     if any(name.startswith('torque') for name in channels):
@@ -187,7 +186,7 @@ def _engine(flights, robot, p, declared, alpha, progress):
         priors |= {name: replace(priors[name], narrow=priors[name].typical)
                     for name, key in keys.items() if key.effect in LAGS}
         entries = [entry for entry in entries if entry.name not in LAGS]
-    return Engine(flights, priors, entries, bounds, far, alpha, progress), keys
+    return Engine(flights, priors, entries, bounds, far, alpha), keys
 
 
 def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
@@ -208,8 +207,7 @@ def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
 
 def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight],
                   robot: RobotParameters, p: GapParameters, declared: Format,
-                  alpha: float = ALPHA, progress: Callable[[str], None] = lambda text: None,
-                  then: Then | None = None) -> dict:
+                  alpha: float = ALPHA, then: Then | None = None) -> dict:
     """
     Results of flights of one format; ``judging`` is held out. ``then`` may add to them.
 
@@ -234,15 +232,14 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
                 for flight in [*flights, *judging] if not flight.usable] + [
         f'{flight.name}: {flight.apart}, so they are not compared'
         for flight in [*flights, *judging] if flight.apart]
-    engine, keys = _engine(usable, robot, p, declared, alpha, progress)
+    engine, keys = _engine(usable, robot, p, declared, alpha)
     solution = engine.run()
-    if groups['torque']['used'] and explained(engine, solution, 'torque') < EXPLAINED:
+    if 'torque' in engine.without_motion:   # rotors scatter, so that means of torques show nothing
         for flight in [*usable, *judging]:
             flight.without(('torque',), FEEDBACK)
         groups = _groups(usable[0], declared)
-        engine, keys = _engine(usable, robot, p, declared, alpha, progress)
+        engine, keys = _engine(usable, robot, p, declared, alpha)
         solution = engine.run()
-    progress('judging')
     judges = [flight for flight in judging if flight.usable] or usable
     slow = [part for f in usable if (part := f.balance(list(keys_of(robot, SLOW))))]
     if slow:

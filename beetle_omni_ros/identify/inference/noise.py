@@ -1,9 +1,12 @@
 """Robust linear fits, intervals from the scatter of blocks, and drift beside a fit."""
 
 from collections.abc import Callable
+from functools import lru_cache
 from itertools import product
+from math import exp, inf, log, log1p, pi
 
 import numpy as np
+from scipy.special import log_ndtr
 from scipy.stats import norm
 from scipy.stats import t as student
 
@@ -129,3 +132,21 @@ def drifting(residuals: list[np.ndarray], signals: list[np.ndarray], slowest: in
 def few_blocks(level: float, blocks: int) -> float:
     """Factor of a variance because the scatter of few blocks is uncertain: Student's t."""
     return float((student.isf(level / 2, max(blocks - 1, 1)) / norm.isf(level / 2))**2)
+
+
+@lru_cache(100_000)      # the same priors end at the same bounds in most sets
+def within_limits(low: float, high: float) -> tuple[float, float, float]:
+    """Ln of the probability that a standard normal is between limits; its mean, variance there."""
+    if low + high > 0:
+        chance, mean, variance = within_limits(-high, -low)
+        return chance, -mean, variance
+    upper = float(log_ndtr(high))
+    less = float(log_ndtr(low)) - upper if low > -inf else -inf
+    chance = upper + log1p(-exp(min(less, -1e-12)))
+    mean = edge = 0.0
+    for sign, x in ((1, low), (-1, high)):
+        if abs(x) < inf:
+            density = sign * exp(-0.5 * x * x - 0.5 * log(2 * pi) - chance)
+            mean += density
+            edge += x * density
+    return chance, mean, min(max(1 + edge - mean * mean, 1e-6), 1.0)

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.bags.bag import BagError, read_messages
 from beetle_omni_ros.identify.flights.page import grids as flight_grids
-from beetle_omni_ros.identify.flights.page import head, summary
+from beetle_omni_ros.identify.flights.page import summary
+from beetle_omni_ros.identify.flights.picture import head
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.inference.hierarchy import WIDTH
 from beetle_omni_ros.identify.servo.fit import (
@@ -78,21 +78,6 @@ def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: Rob
     return result, made_page
 
 
-def is_joint_log(path: Path) -> bool:
-    """Whether a run is a table, or a bag in which joints and commands were recorded alone."""
-    if path.suffix.lower() == '.csv':
-        return True
-    recorded: set[str] = set()
-    try:
-        for raw in read_messages(path):
-            recorded.add(Path(raw.topic).name)
-            if recorded & {'pose', 'data_raw', 'odom'}:     # the rest of a flight is not read
-                return False
-    except (BagError, OSError):
-        return False
-    return recorded >= {'joint_states', 'command'}
-
-
 def compare(log: JointLog, robot: RobotParameters) -> Search:
     """
     The entries by which a log differs from the servos of a robot file as the simulator flies them.
@@ -155,7 +140,7 @@ def _evidence(search, name):
     sign = 1 if name in search.chosen.entries else -1
     on, off = search.chosen.fit, search.trials[name].fit
     held = sign * (on.held - off.held)
-    return {'delta_bic': 2 * search.gains[name],     # twice the logarithm of a Bayes factor
+    return {'ln_bayes_factor': search.gains[name], 'delta_bic': 2 * search.gains[name],
             'cv_gain': 2 * float(held.sum()), 'blocks_positive': int((held > 0).sum())}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.bags.bag import BagError, read_bag
+from beetle_omni_ros.bags.bag import BagError, read_bag, read_messages
 from beetle_omni_ros.model.files import LogError, missing, read_table
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
@@ -319,3 +319,18 @@ def _most_motion(t, command, first, end):
     gain = travel[ends - 1] - travel[first:end]
     begin = first + int(np.argmax(gain))
     return begin, ends[begin - first]
+
+
+def is_joint_log(path: Path) -> bool:
+    """Whether a run is a table, or a bag in which joints and commands were recorded alone."""
+    if path.suffix.lower() == '.csv':
+        return True
+    recorded: set[str] = set()
+    try:
+        for raw in read_messages(path):
+            recorded.add(Path(raw.topic).name)
+            if recorded & {'pose', 'data_raw', 'odom'}:     # the rest of a flight is not read
+                return False
+    except (BagError, OSError):
+        return False
+    return recorded >= {'joint_states', 'command'}
