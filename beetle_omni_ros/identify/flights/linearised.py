@@ -25,7 +25,7 @@ FORM = 0.25             # relative error of an entry by its form
 # Share of the variance that motion must explain: noise that feedback answers in phase then biases
 # a factor by less than the error of form.
 MOVED = 1 / (1 + FORM**2)
-IN_LOOP = 'force', 'torque', 'acceleration', 'rate'     # channels with noise that reaches commands
+IN_LOOP = 'force', 'torque', 'acceleration', 'rate', 'joint'  # noise of these reaches commands
 SAME = 0.04             # share of a typical difference between flights by which one value varies
 FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
 RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
