@@ -69,6 +69,7 @@ class BagFlight:
     """
 
     channels = tuple(name for group in CHANNELS.values() for name in group)
+    turning = 'rate'        # IMU and MoCap agree in it where the robot moves
     highest = np.repeat([FASTEST[group] for group in CHANNELS], [6, 3, 3, 4])
 
     def __init__(self, flight: Recording, robot: RobotParameters, body: BodyModel,

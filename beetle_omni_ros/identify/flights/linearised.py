@@ -25,7 +25,8 @@ FORM = 0.25             # relative error of an entry by its form
 # Share of the variance that motion must explain: noise that feedback answers in phase then biases
 # a factor by less than the error of form.
 MOVED = 1 / (1 + FORM**2)
-IN_LOOP = 'force', 'torque', 'acceleration', 'rate'     # channels with noise that reaches commands
+IN_LOOP = 'force', 'torque', 'acceleration', 'rate', 'joint'  # noise of these reaches commands
+DYNAMIC = range(1, len(EDGES))   # bands without the mean
 SAME = 0.04             # share of a typical difference between flights by which one value varies
 FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
 RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
@@ -38,7 +39,8 @@ class Linearised:
     Several flights with their keys, priors, filters and noise.
 
     Args:
-        flights: objects with ``linear(theta, names)``, ``mask``, ``period`` and ``channels``.
+        flights: objects with ``linear(theta, names)``, ``mask``, ``period``, ``channels`` and
+            ``turning``: group that shows whether the robot moves; '': each shows it itself.
         priors: keys and their priors.
         entries: catalogue entries that may be named.
         bounds: smallest and largest value of a key.
@@ -156,7 +158,7 @@ class Linearised:
     def without_motion(self) -> list[str]:
         """Groups of channels that show only means in every flight."""
         return [kind for kind, own in self._in_loop()
-                if all(sum(each == own for _, each in still) == len(EDGES) - 1
+                if all(sum(each == own for _, each in still) == len(DYNAMIC)
                        for still in self.still)]
 
     def _in_loop(self):
@@ -170,7 +172,8 @@ class Linearised:
         Bands and channels of each flight in which noise hides the motion, but for the mean.
 
         A controller at rest answers noise. Then motion and commands correlate with the noise of
-        the sensors, and a fit takes the answer for the robot.
+        the sensors, and a fit takes the answer for the robot. Where IMU and MoCap show that the
+        robot turns, what the model leaves is no noise, and counts.
         """
         spectra = self._spectra(theta, etas)
         fit, equations = self._learn(spectra)
@@ -179,14 +182,15 @@ class Linearised:
             measured = self._linear(flight, self._at(k, theta + etas[k])).measured
             whole = self.transformed(k, measured).residual
             rest = each.at(fit + equations.of_flight(k, fit))
-            still = []
-            for _, own in self._in_loop():
-                for band in range(1, len(EDGES)):
-                    total, left = ((x[:, each.band == band][..., own]**2).sum()
-                                   for x in (whole, rest))
-                    if left >= (1 - MOVED) * total:
-                        still.append((band, own))
-            found.append(still)
+            bands = {}
+            for kind, own in self._in_loop():
+                left, total = ([float((x[:, each.band == band][..., own]**2).sum())
+                                for band in DYNAMIC] for x in (rest, whole))
+                bands[kind] = [band for band, a, b in zip(DYNAMIC, left, total, strict=True)
+                               if a >= (1 - MOVED) * b]
+            if len(bands.get(flight.turning, DYNAMIC)) < len(DYNAMIC):
+                bands |= dict.fromkeys(('force', 'torque', 'joint'), [])
+            found.append([(band, own) for kind, own in self._in_loop() for band in bands[kind]])
         return found
 
     def _filter(self, spectrum, noise):

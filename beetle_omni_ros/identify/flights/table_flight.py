@@ -10,6 +10,7 @@ agree. Without quaternion, the attitude follows from the direction of the measur
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from scipy.signal import lfilter
@@ -65,6 +66,7 @@ class TableFlight:
 
     """
 
+    turning: ClassVar[str] = ''     # each group of channels shows its own motion
     table: Table
     robot: RobotParameters
     body: BodyModel
