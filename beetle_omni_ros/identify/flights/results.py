@@ -219,12 +219,13 @@ def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Poster
             if not tangent or tangent == of:
                 row = rows.setdefault(of, np.zeros(len(index)))
                 row[index.index(engine.index[name])] += part
+    of_key = {name: keys[name.partition('#')[0]] for name in rows}   # '#': in one flight
     law = CATALOGUE[entry.name].layer not in ('sensor', 'timing')
     for parameter, spec in CATALOGUE[entry.name].parameters.items():
-        own = [name for name in rows if keys[name].parameter == parameter]
+        own = [name for name in rows if of_key[name].parameter == parameter]
         values, spans = [], []
         for name in own:
-            key, row = keys[name], rows[name]
+            key, row = of_key[name], rows[name]
             middle = float(row @ posterior.estimate)
             form = FORM_DEVIATION * middle if law and not key.relative else 0.0
             half = 1.96 * float(row @ posterior.covariance @ row + form**2)**0.5
@@ -232,7 +233,7 @@ def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Poster
             spans.append([max(key.value(middle - half), min(spec.low, values[-1])),
                           min(key.value(middle + half), max(spec.high, values[-1]))])
         if own:
-            base, key, one = [keys[name].base for name in own], keys[own[0]], len(own) == 1
+            base, key, one = [of_key[n].base for n in own], of_key[own[0]], len(own) == 1
             typical = float(engine.typical[engine.index[own[0]]]) if own[0] in engine.index \
                 else key.typical
             found[parameter] = {'value': values[0] if one else values, 'unit': spec.unit,
