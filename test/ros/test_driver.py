@@ -112,7 +112,8 @@ def test_sticks_and_buttons_are_actions_until_the_joystick_is_silent():
     pilot.axes[int(p.axes[0])], pilot.buttons[p.buttons['arm']] = float(p.signs[0]), 1
     pilot.time = lambda: 5.1
     order, shift = next(actions)
-    assert order.name == 'arm' and shift.values[0] == pytest.approx([0.1 * p.speed, 0, 0])
+    assert order == ('arm', ()) and shift[0] == 'shift'
+    assert shift[1][0] == pytest.approx([0.1 * p.speed, 0, 0])
     pilot.time = lambda: 5.2
     assert len(next(actions)) == 1      # the button is still pressed
     pilot.time = lambda: 5.2 + 2 * p.joystick_timeout
