@@ -117,14 +117,20 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
     if corrected:
         write_corrected(corrected, result, model, robot, tolerances)
     _print(console, result)
-    more = '--apply FILE a robot file' if result['effects'] else \
-        '--learn FILE an effect that no entry has' if result['held_out'] and not learn \
-        and 'joints' not in result else '--json FILE all numbers'
     print_end(console, (corrected, written, page, json_path), (
         'evaluate', '--robot', corrected) if corrected
               else 'no robot file, because no effect is named' if apply else
-              f'the same with --report FILE writes a page, with {more}')
+              f'the same with --report FILE writes a page, with {_further(result, learn)}')
     return result
+
+
+def _further(result, learn):
+    """Option that may come next, and what it writes."""
+    if result['effects']:
+        return '--apply FILE a robot file'
+    if result['held_out'] and not learn and 'joints' not in result:
+        return '--learn FILE an effect that no entry has'
+    return '--json FILE all numbers'
 
 
 def _tables(runs, holdout, robot, p, form, alpha, progress, then):
