@@ -40,7 +40,7 @@ class Linearised:
 
     Args:
         flights: objects with ``linear(theta, names)``, ``mask``, ``period``, ``channels`` and
-            ``turning``: group that shows whether the robot moves; '': each shows it itself.
+            ``turning``: group that shows whether the robot moves; '': the torques alone do.
         priors: keys and their priors.
         entries: catalogue entries that may be named.
         bounds: smallest and largest value of a key.
@@ -188,9 +188,12 @@ class Linearised:
                                 for band in DYNAMIC] for x in (rest, whole))
                 bands[kind] = [band for band, a, b in zip(DYNAMIC, left, total, strict=True)
                                if a >= (1 - MOVED) * b]
-            if len(bands.get(flight.turning, DYNAMIC)) < len(DYNAMIC):
+            if not flight.turning:      # what the model lacks is more than the noise
+                bands = {'torque': bands.get('torque', [])}
+            elif len(bands[flight.turning]) < len(DYNAMIC):
                 bands |= dict.fromkeys(('force', 'torque', 'joint'), [])
-            found.append([(band, own) for kind, own in self._in_loop() for band in bands[kind]])
+            found.append([(band, own) for kind, own in self._in_loop()
+                          for band in bands.get(kind, [])])
         return found
 
     def _filter(self, spectrum, noise):
