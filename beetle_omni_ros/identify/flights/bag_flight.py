@@ -56,8 +56,7 @@ class BagFlight:
     Signals, body equations and servos of one flight; all flights share the body equations.
 
     Attributes:
-        modules: share of the file's tilting modules in the model, 0 or 1; fits vary it around
-            that.
+        modules: share of the file's tilting modules in the model, 0 or 1; fits vary it.
         trusted: (N,) whether a grid point is away from the ground and from the rotor limits.
         period: of the samples [s].
         mask: (M, 16) samples that count.
@@ -124,8 +123,9 @@ class BagFlight:
         inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': s.imu(theta)[1],
                   'tilt': tilt, 'tilt_rate': tilt_rate, 'tilt_acceleration': tilt_acceleration,
                   'thrust': thrust, 'thrust_rate': thrust_rate, 'position': position,
-                  'voltage': s.voltage, 'charge': s.charge,
-                  'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0))}
+                  'voltage': s.voltage,
+                  'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0)),
+                  **{f'state of {name}': s.state(name, theta) for name in self._body.slow}}
         return {name: values[self.rows] for name, values in inputs.items()}
 
     def residual(self, theta: dict[str, float], groups: str = 'BAWJ') -> dict[str, np.ndarray]:
@@ -213,13 +213,14 @@ class BagFlight:
     def _slopes(self, theta, now, names):
         """(M, 16, K) derivatives by keys at ``theta``, where the residual is ``now``."""
         slopes = np.zeros((len(names), len(self.channels), len(self.rows))).T
-        body = [k for k, name in enumerate(names) if self.keys[name].body]
+        body = [k for k, name in enumerate(names) if self.keys[name].body
+                and self.keys[name].effect not in self._body.slow]
         if body:
             slopes[:, PLACE['B'], body] = -self._body.derivatives(
                 self._inputs(theta), theta, tuple(names[k] for k in body))
         for k, name in enumerate(names):
             key = self.keys[name]
-            groups = '' if key.body else key.groups.replace('J', '')
+            groups = '' if k in body else key.groups.replace('J', '')
             if name in POSE_SHIFTS:
                 groups = groups.replace('A', '').replace('W', '')
                 slopes[:, 6:12, k] = POSE_SHIFTS[name] * self._of_pose_shift(theta)

@@ -150,8 +150,9 @@ class TableFlight:
         inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': rate, 'tilt': tilt,
                   'thrust': np.zeros((n, 4)), 'tilt_rate': np.gradient(tilt, h, axis=0),
                   'tilt_acceleration': np.zeros((n, 4)), 'thrust_rate': np.zeros((n, 4)),
-                  'position': position, 'voltage': np.ones(n), 'charge': np.zeros(n),
-                  'modules': np.zeros(n)}
+                  'position': position, 'voltage': np.ones(n),
+                  'modules': np.zeros(n),
+                  **{f'state of {name}': np.zeros((n, 4)) for name in self.body.slow}}
         return inputs, np.concatenate([force, turned], axis=1), reasons
 
     def _compared(self):
