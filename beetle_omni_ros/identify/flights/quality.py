@@ -214,10 +214,15 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
             a[:, np.flatnonzero(small.band == band)[:, None], np.isin(own, lost)] = 0.0
         a = (root @ a[:, :count]).reshape(len(rest), -1, effect.shape[2])
         b = (rest[:, :count][..., own] @ root.T).reshape(len(rest), -1, 1)
-        parts.append((a.transpose(0, 2, 1) @ a, (a * b).sum(axis=1),
-                      (a * b**2).transpose(0, 2, 1) @ a))
-    info, score, scatter = (np.concatenate(part) for part in zip(*parts, strict=True))
-    rng, (values, vectors) = np.random.default_rng(0), np.linalg.eigh(scatter)
+        parts.append((a, b))
+    info = np.concatenate([a.transpose(0, 2, 1) @ a for a, _ in parts])
+    score = np.concatenate([(a * b).sum(axis=1) for a, b in parts])
+    inner = np.linalg.inv(info.sum(axis=0) + np.eye(len(info[0])) / RELEVANT**2)
+    weights, scatter = inner @ score.sum(axis=0), []
+    for a, b in parts:      # noise has nothing that laws explain of a coefficient by the others
+        b = (b[..., 0] - a @ weights) / (1 - ((a @ inner) * a).sum(axis=2))
+        scatter.append((a * b[..., None]**2).transpose(0, 2, 1) @ a)
+    rng, (values, vectors) = np.random.default_rng(0), np.linalg.eigh(np.concatenate(scatter))
     roots = vectors * np.sqrt(np.maximum(values, 0))[:, None]
     drawn = rng.normal(size=(len(score), DRAWS, len(roots[0]))) @ roots.transpose(0, 2, 1)
     drawn += OMITTED * rng.normal(size=drawn.shape[1:]) @ info
