@@ -23,17 +23,12 @@ LEAN = 0.3              # [rad] scale of the tilt of the body
 
 def discrepancies(flights: Sequence) -> list[np.ndarray]:
     """
-    Slopes of the channels by the weights of the discrepancy.
+    Slopes (N, C, 7, P) of the channels by the weights of the discrepancy, of each flight.
 
-    Args:
-        flights: objects with ``robot``, ``channels``, ``motion`` and ``time`` [s] of N samples.
-
-    Returns:
-        (N, C, 7, P) of each flight: channels by the thrust of each rotor and world forces. Thrusts
-        and forces are of relative size one: hover thrust, and the weight.
-
+    They are those by the thrust of each rotor and by world forces, relative to hover thrust and
+    weight. ``flights`` have ``robot``, ``channels``, ``motion`` and ``time`` [s] of N samples.
     """
-    features, made = [_features_of(flight.motion, flight.time) for flight in flights], []
+    made, features = [], [_features_of(flight.motion, flight.time) for flight in flights]
     mean = np.concatenate(features).mean(axis=0)
     for flight, own in zip(flights, features, strict=True):
         robot, turn = flight.robot, Rotation.from_quat(flight.motion['quaternion']).as_matrix()

@@ -191,13 +191,8 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
     The gain of a group of weights with covariance M is the sum of h_b' M h_c / 2 over pairs of
     blocks with scores h. The group counts that most exceeds what the power of the noise gives.
 
-    Args:
-        flights: with ``robot``, ``motion`` and ``time``.
-        spectra: of the flights.
-        left: (B, F, C) whitened residual of each flight after the fit.
-        filters: (C, L) whitening filters of each flight.
-        channels: names of all channels.
-
+    ``flights`` have ``robot``, ``motion`` and ``time``, ``filters`` (C, L) whiten each of them.
+    The others are as of :func:`line`.
     """
     own, (slopes, groups) = spectra[0].parts[0][0], laws(flights)
     parts = []
