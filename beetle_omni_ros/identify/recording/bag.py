@@ -13,7 +13,8 @@ from beetle_omni_ros.model.parameters import JOINT_NAMES
 NEEDED = IMU, POSE, JOINTS, COMMAND = 'imu/data_raw', 'mocap/pose', 'joint_states', 'command'
 BATTERY = 'battery_state'
 # topic -> the columns of its table
-PARTS = {topic: CHANNELS[topic] for topic in (*NEEDED, BATTERY)} | {JOINTS: {'position': 4}}
+PARTS = {topic: CHANNELS[topic] for topic in NEEDED} | {
+    JOINTS: {'position': 4}, BATTERY: {'voltage': 1}}
 
 
 @dataclass
@@ -26,9 +27,8 @@ class Recording:
         times: topic -> (N,) header stamps [s], in the order of recording. Those of a flight are
             relative to its start, ascending and unique.
         values: topic -> (N, width): IMU specific force [m/s^2] and rates [rad/s], position [m] and
-            quaternion xyzw, joint positions [rad], tilt [rad] and thrust [N] commands, voltage [V]
-            and current [A]; of a flight, sign-continuous quaternions and, in place of the current,
-            the charge drawn since the first message [A h], zero if no current is known.
+            quaternion xyzw, joint positions [rad], tilt [rad] and thrust [N] commands, voltage
+            [V]; of a flight, sign-continuous quaternions.
         states: (time of recording, supervisor state), if recorded.
         findings: remarks of reading and checks.
         received: topic -> (N,) times of recording [s]; empty if unknown.

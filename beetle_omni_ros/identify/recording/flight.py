@@ -6,11 +6,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from beetle_omni_ros.bags.bag import bag_files
 from beetle_omni_ros.identify.recording.bag import (
-    BATTERY,
     changed,
     COMMAND,
     Damage,
@@ -110,7 +108,7 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
     if few := [Damage(name, topic, f'missing or nearly empty: {count} messages')
                for topic, count in counts.items() if count < LEAST]:
         raise UnusableFlight(*few)
-    part = flown(_with_charge(recording), robot, p)
+    part = flown(recording, robot, p)
     if part is None:
         raise UnusableFlight(Damage(name, COMMAND, 'the robot does not fly: commanded thrust is '
                                     f'never above {p.lifted:g} of its weight'))
@@ -153,18 +151,6 @@ def _in_order(name, topic, recording, findings):
     if lost > 2:
         findings.append(f'{name}: {topic}: {lost} stamps occur twice')
     return t, values[first]
-
-
-def _with_charge(recording):
-    """The charge drawn since the first message [A h] in place of the current of either sign."""
-    t, (voltage, current) = recording.times[BATTERY], recording.values[BATTERY].T
-    known = np.isfinite(t) & np.isfinite(current)
-    at, rows = np.unique(t[known], return_index=True)
-    drawn = np.zeros(len(t))
-    if len(at) > 1:
-        charge = cumulative_trapezoid(current[known][rows], at, initial=0) / 3600
-        drawn = np.interp(t, at, np.abs(charge))
-    return changed(recording, BATTERY, values=np.column_stack([voltage, drawn]))
 
 
 def _without_gaps(name, series, lead, p, findings, origin):
