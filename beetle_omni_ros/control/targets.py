@@ -188,28 +188,19 @@ def read_set_points(path: str | Path, period: float
         ParameterError: unusable file, or a pose outside the fence or too low.
 
     """
+    from scipy.interpolate import CubicSpline  # would double the time to start
+    from scipy.spatial.transform import Rotation, RotationSpline
     rows = _rows(path, 'set_points', ('time_s', *COLUMNS), 3)
     if rows[0, 0] != 0 or not (np.diff(rows[:, 0]) > 0).all():
         raise ParameterError(f'{path}: set_points: expected times that increase from 0')
-    times, positions, quaternions = through(rows, period)
+    times = np.linspace(0.0, rows[-1, 0], max(round(rows[-1, 0] / period), 2) + 1)
+    positions = CubicSpline(rows[:, 0], rows[:, 1:4], bc_type='clamped')(times)
+    turns = Rotation.from_euler('xyz', rows[:, 4:], degrees=True)
+    quaternions = RotationSpline(rows[:, 0], turns)(times).as_quat()
     for time, *pose in zip(times, positions, quaternions, strict=True):
         if reason := _checks().why_not_pose(*pose):
             raise ParameterError(f'{path}: at {time:.4g} s: {reason}')
     return times, positions, quaternions
-
-
-def through(rows: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Splines through set points (N, 7), from rest to rest.
-
-    Args and returns are those of :func:`read_set_points`; rows are as in its file.
-    """
-    from scipy.interpolate import CubicSpline  # would double the time to start
-    from scipy.spatial.transform import Rotation, RotationSpline
-    times = np.linspace(0.0, rows[-1, 0], max(round(rows[-1, 0] / period), 2) + 1)
-    turns = Rotation.from_euler('xyz', rows[:, 4:], degrees=True)
-    return times, CubicSpline(rows[:, 0], rows[:, 1:4], bc_type='clamped')(times), \
-        RotationSpline(rows[:, 0], turns)(times).as_quat()
 
 
 def has_poses(path: str | Path) -> bool:

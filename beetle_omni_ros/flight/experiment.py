@@ -5,12 +5,10 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.bags.log import FlightLog
 from beetle_omni_ros.bags.metrics import metrics
 from beetle_omni_ros.bags.task_metrics import U_WINDOW
-from beetle_omni_ros.control.targets import through
 from beetle_omni_ros.control.tasks import POSE_DURATION, poses_task, random_poses, Task
 from beetle_omni_ros.flight.campaign import Store, sweep
 from beetle_omni_ros.flight.compare import ComparedFlight, fly_flight
@@ -22,7 +20,8 @@ from beetle_omni_ros.model.schema import RunError
 from beetle_omni_ros.show.page import Grid, number
 
 DURATION = 56.0         # [s] of a task
-STEP = 3.0              # [s] between level set points
+STEP = 1.6              # [s] of a move between level poses
+PERIOD = 0.1            # [s] between their set points
 CONTROLLER = 'nmpc'
 # Margins. A loaded pack gives less thrust than a full one, and gusts need some.
 MOST_THRUST = 0.9       # of the largest thrust, while a pose is held
@@ -47,7 +46,7 @@ class Experiments:
         """(N, 6) x, y, z [m], roll, pitch, yaw [deg] from a seed."""
         count = (DURATION - POSE_DURATION) // STEP if level else DURATION // POSE_DURATION
         poses = random_poses(int(count) + level, seed).round(2)
-        return poses * [1, 1, 1, 0, 0, 1] if level else poses
+        return poses * [0.5, 0.5, 1, 0, 0, 1] if level else poses
 
     def flown(self, poses: np.ndarray, plant: RobotParameters) -> FlightLog | None:
         """Fly poses with a plant in the simulator; None if a margin is lost."""
@@ -62,36 +61,43 @@ class Experiments:
         """Whether each pose is reached, with margins of thrust and height, by the controller."""
         held = (log.command.t - log.begin) % POSE_DURATION >= U_WINDOW[0]
         thrust = log.command.thrust[held & (log.command.t >= log.begin)]
-        return metrics(log, task)['success_rate'] == 1 and all(
-            mode.state == FLYING for t, mode in zip(log.state_t, log.states, strict=True)
-            if t > log.begin) and self.is_gentle(
-                thrust, log.truth.position[log.truth.t >= log.begin])
+        height = log.truth.position[log.truth.t >= log.begin, 2]
+        return metrics(log, task)['success_rate'] == 1 and self.is_gentle(thrust) \
+            and height.min() >= LEAST_HEIGHT and all(mode.state == FLYING for t, mode in zip(
+                log.state_t, log.states, strict=True) if t > log.begin)
 
-    def is_gentle(self, thrust: np.ndarray, position: np.ndarray) -> bool:
-        """Whether thrusts (N, 4) [N] and positions (M, 3) [m] keep their margins."""
-        return bool(thrust.max() <= MOST_THRUST * self._robot.rotors.thrust_max
-                    and position[:, 2].min() >= LEAST_HEIGHT)
+    def is_gentle(self, thrust: np.ndarray) -> bool:
+        """Whether thrusts (N, 4) [N] keep a margin."""
+        return bool(thrust.max() <= MOST_THRUST * self._robot.rotors.thrust_max)
 
     @staticmethod
     def level_motion(poses: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, 3) [m] and yaw (N,) [rad] through level poses."""
-        _, positions, quaternions = through(_timed(poses), period)
-        return positions, Rotation.from_quat(quaternions).as_euler('xyz')[:, 2]
+        """Positions (N, 3) [m] and yaw (N,) [rad] of moves between poses, from the ground."""
+        ground = poses[0] * [1, 1, 0, 0, 0, 1]
+        rise = POSE_DURATION / 2 * np.arange(2)
+        motion = _moved([*rise, *(POSE_DURATION + STEP * np.arange(len(poses)))],
+                        np.vstack([ground, poses[0], poses]), period)
+        return motion[:, 1:4], np.radians(motion[:, 6])
 
     @staticmethod
     def write(path: Path, poses: np.ndarray, level: bool, head: str) -> None:
         """Write poses as a task; ``head`` are lines of comment."""
-        key, columns, rows = ('set_points', 'time [s], ', _timed(poses)) if level else (
-            'poses', '', poses)
+        key, columns, rows = ('set_points', 'time [s], ', _moved(
+            STEP * np.arange(len(poses)), poses, PERIOD)) if level else ('poses', '', poses)
         lines = [*(f'# {line}' for line in head.splitlines()),
                  f'# Rows: {columns}x, y, z [m], roll, pitch, yaw [deg].', f'{key}:',
-                 *(f"- [{', '.join(f'{value:g}' for value in row + 0.0)}]" for row in rows)]
+                 *(f"- [{', '.join(f'{value:.5g}' for value in row + 0.0)}]" for row in rows)]
         write_text(path, '\n'.join([*lines, '']), 'task')
 
 
-def _timed(poses):
-    """Set points (N, 7): time [s] and level pose."""
-    return np.column_stack([STEP * np.arange(len(poses)), poses])
+def _moved(times, poses, period):
+    """Set points (N, 7), time [s] and pose: moves from rest to rest with continuous jerk."""
+    times = np.asarray(times)
+    t = period * np.arange(round(times[-1] / period) + 1)
+    k = np.clip(np.searchsorted(times, t, side='right') - 1, 0, len(times) - 2)
+    s = ((t - times[k]) / (times[k + 1] - times[k]))[:, None]
+    share = s**4 * (35 - 84 * s + 70 * s**2 - 20 * s**3)
+    return np.column_stack([t, poses[k] + share * (poses[k + 1] - poses[k])])
 
 
 # --- flights with the file before and with the corrected one -------------------------------------

@@ -8,14 +8,14 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 from beetle_omni_ros.flight.experiment import Experiments
-from beetle_omni_ros.identify.flights.evidence import log_prior
+from beetle_omni_ros.identify.flights.evidence import Judge, log_prior, normal
 from beetle_omni_ros.identify.flights.flat import flat_flight
 from beetle_omni_ros.identify.flights.keys import Entry
 from beetle_omni_ros.identify.flights.next_flight import (
-    chosen,
     Explanation,
     Outlook,
     Planner,
+    posterior_of,
     Sight,
 )
 from beetle_omni_ros.identify.flights.spectrum import spectrum
@@ -28,16 +28,19 @@ KEYS = 4        # two candidates, a nuisance, and one that differs from flight t
 MANY = 2000     # blocks, so that the scatter of few does not count
 
 
-def outlook(odds=(0.0, 0.0)):
+def hypotheses():
+    means = np.array([[0.8, 0, 0, 0], [0, 0.8, 0, 0]])
+    spread = np.diag([0.1, 0.1, 0.5, 0.1])**2
+    return [Explanation(label, (k,), 0.0, means[k], spread + 0.2**2 * np.diag(np.eye(KEYS)[k]))
+            for k, label in enumerate('ab')]
+
+
+def outlook():
     engine = SimpleNamespace(
         names=list('abcd'), narrow=np.full(KEYS, 0.1), typical=np.array([1.0, 1.0, 0.0, 0.0]),
         flight=np.array([0.0, 0.0, 0.0, 0.5]), alpha=0.05, entries=[0, 1])
     solution = SimpleNamespace(spectra=[SimpleNamespace(residual=np.zeros(MANY))])
-    means = np.array([[0.8, 0, 0, 0], [0, 0.8, 0, 0]])
-    spread = np.diag([0.1, 0.1, 0.5, 0.1])**2
-    return Outlook(engine, solution, [
-        Explanation(label, (k,), odds[k], means[k], spread + 0.2**2 * np.diag(np.eye(KEYS)[k]))
-        for k, label in enumerate('ab')])
+    return Outlook(engine, solution, hypotheses())
 
 
 def gram(*rows):
@@ -45,38 +48,24 @@ def gram(*rows):
     return slopes.T @ slopes
 
 
-def test_the_expected_evidence_is_the_mean_of_the_log_density_ratio_of_measurements():
-    view, slopes = outlook(odds=(0.0, 1.0)), np.array([[2.0, 0, 1, 0], [1.0, -1, 0, 0]])
-    expected = view.evidence(view.information([gram(*slopes)]))
-    densities = [multivariate_normal(slopes @ h.mean, slopes @ h.covariance @ slopes.T + np.eye(2))
-                 for h in view.hypotheses]
-    for i, j in ((0, 1), (1, 0)):
-        z = densities[i].rvs(200_000, random_state=1)
-        ratio = (densities[i].logpdf(z) - densities[j].logpdf(z)).mean()
-        assert expected[i, j] == pytest.approx(
-            view.odds[i] - view.odds[j] + ratio, abs=0.02)
-
-
 def test_what_a_nuisance_or_the_flight_explains_as_well_decides_little():
     view = outlook()
-    clean, hidden = gram([3.0, 0, 0, 0]), gram([3.0, 0, 0, 3e3])
-    value = [view.value(view.information([each])) for each in (clean, hidden)]
-    assert value[1] < 0.5 * value[0]
-    both = gram([3.0, 3.0, 0, 0])       # the sum of the candidates does not tell them apart
-    apart = gram([3.0, -3.0, 0, 0])
-    assert chosen(view, {'both': both, 'apart': apart, 'hidden': hidden}, 2) == ['apart'] * 2
+    clean, hidden, both, apart = (view.chances([gram(row)])[:, 0].mean() for row in (
+        [3.0, 0, 0, 0], [3.0, 0, 0, 3e3], [3.0, 3.0, 0, 0], [3.0, -3.0, 0, 0]))
+    assert hidden < 0.5 * clean
+    assert both < 0.5 * apart       # the sum of the candidates does not tell them apart
 
 
 def test_the_probability_of_a_decision_is_that_of_simulated_measurements():
     view, slopes = outlook(), np.array([[2.0, -2.0, 0, 0]])
-    chances = view.chances(view.information([gram(*slopes)]))
+    chances = view.chances([gram(*slopes)])
     densities = [multivariate_normal(slopes @ h.mean, slopes @ h.covariance @ slopes.T + np.eye(1))
-                 for h in view.hypotheses]
+                 for h in hypotheses()]
     for k in (0, 1):
         z = densities[k].rvs(100_000, random_state=2)[:, None]
         ratio = densities[k].logpdf(z) - densities[1 - k].logpdf(z)
         assert chances[k] == pytest.approx([(ratio > np.log(20)).mean(),
-                                            (ratio < -np.log(20)).mean()], abs=0.06)
+                                            (ratio < -np.log(20)).mean()], abs=0.03)
 
 
 @pytest.mark.parametrize('verdict', ['named', 'no_gap', 'unknown'])
@@ -88,7 +77,8 @@ def test_after_a_decision_there_is_no_task(verdict, tmp_path):
 
 
 def test_a_flight_of_level_rotors_obeys_the_body_equations(crazyflie):
-    position, yaw = Experiments.level_motion(['passes along x', 'yaw swings'], crazyflie.period)
+    position, yaw = Experiments.level_motion(
+        Experiments.poses(0, level=True), crazyflie.period)
     flight = flat_flight(crazyflie, position, yaw)
     assert flight.channels == crazyflie.channels
     inside = (flight.time > 9.0) & (flight.time < 23.0)
@@ -119,8 +109,8 @@ def test_an_effect_is_named_with_the_probability_that_its_evidence_suffices():
         flight=np.zeros(2), entries=[Entry(name, (name,)) for name in names],
         indices=lambda chosen: list(chosen))
     sight = Sight(engine, SimpleNamespace(spectra=[found]), ['one'])
-    more = gram([30.0, 0.0])[:2, :2]
-    info = found.grams()[0].sum(axis=(0, 1))[0, 0] + more[0, 0]
+    more = [gram([30.0, 0.0])]
+    info = found.grams()[0].sum(axis=(0, 1))[0, 0] + sight.information(more)[0, 0]
     null = 1 / info + 0.01**2
     wide = null + 0.3**2
     # ln B > least for an estimate beyond a limit
@@ -128,5 +118,21 @@ def test_an_effect_is_named_with_the_probability_that_its_evidence_suffices():
     limit = np.sqrt((least + 0.5 * np.log(wide / null)) * 2 / (1 / null - 1 / wide))
     expected = 2 * norm.sf(limit / np.sqrt(wide))
     assert 0.2 < expected < 0.9
-    assert sight.chances(more)[0] == pytest.approx([expected, 0.0], abs=0.06)
-    assert sight.value(0 * more) < sight.value(more) <= 1.0
+    assert sight.chances(more)[0] == pytest.approx([expected, 0.0], abs=0.03)
+    assert sight.chances([0 * more[0]])[0, 0] < expected
+
+
+def test_a_limit_that_acts_has_a_factor_of_one_in_a_set_with_it_and_of_zero_in_others():
+    rng, narrow, typical = np.random.default_rng(4), np.full(2, 0.03), np.array([1.0, 0.3])
+    slopes = rng.normal(size=(1600, 1, 2))
+    found = spectrum(-slopes @ [1.0, 0.0], slopes, np.ones((1600, 1), dtype=bool), 0.01,
+                     np.full(1, 1e-6), np.inf, [np.arange(1)])
+    found.noise[:] = 16.0
+    engine = SimpleNamespace(narrow=narrow, typical=typical, indices=list)
+    equations, no = normal([found], ['limit', 'other'], np.zeros(2)), np.zeros(2, dtype=bool)
+    judge = Judge(equations, narrow, typical, np.array([[0.0, np.inf], [-np.inf, np.inf]]), no,
+                  np.arange(2), 0.05, no, np.array([True, False]))
+    solution = SimpleNamespace(spectra=[found], banned={}, judge=judge)
+    acting, without = (posterior_of(engine, solution, equations, (k,))[0] for k in (0, 1))
+    assert acting[0] == pytest.approx(1.0, abs=0.005)
+    assert without[0] < 0.5     # the data alone would have 0.1 as standard deviation

@@ -3,9 +3,10 @@ The next flight: random poses whose measurements answer what the flights left op
 
 The hypotheses are sets of catalogue entries. Under hypothesis i, the keys theta have the posterior
 N(m_i, P_i) of the flights so far. A flight with the information M of all keys measures
-z = L' theta + e, where M = L L' and e is white, so that z is N(L' m_i, L' P_i L + 1). The expected
-evidence for i over j is the divergence of these two normal densities. Whatever another hypothesis,
-a tolerance, the flight or the discrepancy explains as well, it does not count.
+z = L' theta + e, where M = L L' and e is white, so that z is N(L' m_i, L' P_i L + 1). Whatever
+another hypothesis, a tolerance, the flight or the discrepancy explains as well, it does not count.
+Of some sequences of random poses, the one with the largest probability of a right answer is
+written.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from scipy.stats import multivariate_normal
 from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.evidence import log_prior, normal, Solution
+from beetle_omni_ros.identify.flights.evidence import log_prior, Normal, normal, Solution
 from beetle_omni_ros.identify.flights.flat import flat_flight
 from beetle_omni_ros.identify.flights.results import member_of, named_of, parameters, Starts
 from beetle_omni_ros.identify.flights.spectrum import pooled
@@ -37,8 +38,7 @@ from beetle_omni_ros.model.schema import ParameterError
 OPEN = 'named_set', 'not_decidable'     # verdicts
 MOST = 5                # hypotheses that are compared
 SIMULATED = 2           # of these, the most probable ones are plants of the check of the task
-ENOUGH = 25.0           # [nat] of evidence; more is not better
-SAMPLES = 400           # of measurements of each hypothesis
+SAMPLES = 4000          # of measurements of each hypothesis
 FAINT = 1e-4            # information in units of the priors that does not count
 TASKS = 4               # sequences of random poses of which the best is written
 
@@ -76,13 +76,14 @@ def hypotheses_of(engine: Engine, solution: Solution) -> list[Explanation]:
         own = tuple(sorted({*best, j} - ({k} - {j})))
         found.append(Explanation(
             solution.entries[j].label, own, engine.gain(solution.judge, own, best),
-            *_posterior(engine, solution, equations, own)))
+            *posterior_of(engine, solution, equations, own)))
     return found
 
 
-def _posterior(engine, solution, equations, chosen):
+def posterior_of(engine: Engine, solution: Solution, equations: Normal,
+                 chosen: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """
-    Mean and covariance of all keys, with the priors that the engine has for a set.
+    Mean (K,) and covariance (K, K) of all keys, with the priors that the engine has for a set.
 
     The factor of a limit that acts is one in a set that has it, not zero.
     """
@@ -90,10 +91,10 @@ def _posterior(engine, solution, equations, chosen):
     free = engine.indices((*chosen, *solution.banned))
     prior[free] = np.hypot(prior[free], engine.typical[free])
     c, _, _, _, slab = solution.judge._profile(tuple(sorted(engine.indices(chosen))))
-    chosen = np.isin(c, free)
-    prior[c] = np.where(chosen, slab, prior[c])
+    own = np.isin(c, free)
+    prior[c] = np.where(own, slab, prior[c])
     right = equations.right.copy()
-    right[c] += chosen * solution.judge.acting[c] * slab**-2
+    right[c] += own * solution.judge.acting[c] * slab**-2
     covariance = prior[:, None] * np.linalg.inv(
         prior[:, None] * equations.info * prior + np.eye(len(prior))) * prior
     return covariance @ right, covariance
@@ -106,7 +107,7 @@ class Gain:
         self._engine = engine
         self._blocks = sum(len(each.residual) for each in solution.spectra)
 
-    def information(self, grams: Sequence[np.ndarray]) -> np.ndarray:
+    def information(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """(K, K) information of blocks of one flight without what differs between flights."""
         engine, total = self._engine, np.sum(grams, axis=0)
         own = np.flatnonzero(engine.flight > 0)
@@ -120,43 +121,21 @@ class Outlook(Gain):
 
     def __init__(self, engine: Engine, solution: Solution, hypotheses: Sequence[Explanation]):
         super().__init__(engine, solution)
-        self.hypotheses, self._scale = list(hypotheses), np.hypot(engine.narrow, engine.typical)
+        self._hypotheses, self._scale = list(hypotheses), np.hypot(engine.narrow, engine.typical)
         odds = np.array([each.odds for each in hypotheses])
         self.odds, self.weights = odds, np.exp(odds - np.logaddexp.reduce(odds))
         self.question = 'decides between ' + ' and '.join(each.label for each in hypotheses)
         self.labels = [each.label for each in hypotheses]
 
-    def measured(self, information: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Mean (r,) and covariance (r, r) of the measurements under each hypothesis."""
-        s = self._scale
-        values, vectors = np.linalg.eigh(s[:, None] * information * s)
+    def chances(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
+        """(H, 2) probability that each hypothesis, if true, is decided, and another one is."""
+        s, rng = self._scale, np.random.default_rng(0)
+        values, vectors = np.linalg.eigh(s[:, None] * self.information(grams) * s)
         keep = values > FAINT
         root = np.sqrt(values[keep]) * vectors[:, keep] / s[:, None]
-        return [(root.T @ each.mean, root.T @ each.covariance @ root + np.eye(keep.sum()))
-                for each in self.hypotheses]
-
-    def evidence(self, information: np.ndarray) -> np.ndarray:
-        """(H, H) expected ln of the probability of each hypothesis, if true, over another one."""
-        moments = self.measured(information)
-        inverses = [np.linalg.inv(covariance) for _, covariance in moments]
-        volumes = [np.linalg.slogdet(covariance)[1] for _, covariance in moments]
-        gains = self.odds[:, None] - self.odds
-        for i, (mean, covariance) in enumerate(moments):
-            for j, (other, _) in enumerate(moments):
-                away = mean - other
-                gains[i, j] += 0.5 * (np.sum(inverses[j] * covariance) - len(mean)
-                                      + away @ inverses[j] @ away + volumes[j] - volumes[i])
-        return gains
-
-    def value(self, information: np.ndarray) -> float:
-        """Mean of the evidence for the truth over its strongest rival [nat]."""
-        gains = np.minimum(self.evidence(information), ENOUGH)
-        np.fill_diagonal(gains, np.inf)
-        return float(self.weights @ gains.min(axis=1))
-
-    def chances(self, information: np.ndarray, seed: int = 0) -> np.ndarray:
-        """(H, 2) probability that each hypothesis, if true, is decided, and another one is."""
-        moments, rng = self.measured(information), np.random.default_rng(seed)
+        # mean (r,) and covariance (r, r) of the measurements under each hypothesis
+        moments = [(root.T @ each.mean, root.T @ each.covariance @ root + np.eye(keep.sum()))
+                   for each in self._hypotheses]
         least, found = log(1 / self._engine.alpha), []
         for k, (mean, covariance) in enumerate(moments):
             z = rng.multivariate_normal(mean, covariance, SAMPLES, method='cholesky')
@@ -182,42 +161,26 @@ class Sight(Gain):
         self._keys = [[engine.indices((k,)) for k, entry in enumerate(engine.entries)
                        if entry.name == name and not entry.varying] for name in names]
 
-    def _variances(self, information):
-        """For each effect, of each of its entries (d, d): of the estimate without and with it."""
-        engine, narrow = self._engine, self._engine.narrow
-        covariance = narrow[:, None] * np.linalg.inv(
-            narrow[:, None] * (self._info + information) * narrow + np.eye(len(narrow))) * narrow
-
-        def both(c):
-            values, vectors = np.linalg.eigh(
-                np.linalg.inv(covariance[np.ix_(c, c)]) - np.diag(narrow[c]**-2))
-            null = (vectors / np.maximum(values, 1e-9 * narrow[c].min()**-2)) @ vectors.T \
-                + np.diag(narrow[c]**2)
-            return null, null + np.diag(engine.typical[c]**2)
-        return [[both(c) for c in entries] for entries in self._keys]
-
-    def value(self, information: np.ndarray) -> float:
-        """Mean of the expected evidence over what is needed, at most one for each effect."""
-        return float(np.mean([min(max(_divergence(*both) for both in entries), self._least)
-                              for entries in self._variances(information)])) / self._least
-
-    def chances(self, information: np.ndarray, seed: int = 0) -> np.ndarray:
+    def chances(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """(H, 2) probability that each effect is named if it is there, and 0."""
-        rng, found = np.random.default_rng(seed), []
-        for entries in self._variances(information):
-            null, wide = max(entries, key=lambda both: _divergence(*both))
-            zero = np.zeros(len(null))
-            z = rng.multivariate_normal(zero, wide, SAMPLES)
-            gain = multivariate_normal.logpdf(z, zero, wide) - multivariate_normal.logpdf(
-                z, zero, null)
-            found.append([(gain > self._least).mean(), 0.0])
-        return np.array(found)
+        narrow = self._engine.narrow
+        covariance = narrow[:, None] * np.linalg.inv(
+            narrow[:, None] * (self._info + self.information(grams)) * narrow
+            + np.eye(len(narrow))) * narrow
+        # of an effect with several entries, that of the clearest one
+        return np.array([[max(self._chance(covariance, c) for c in entries), 0.0]
+                         for entries in self._keys])
 
-
-def _divergence(null, wide):
-    """Mean ln of the evidence [nat] for a normal density with a wide variance, if it is true."""
-    ratio = np.linalg.solve(null, wide)
-    return 0.5 * float(np.trace(ratio) - len(null) - np.linalg.slogdet(ratio)[1])
+    def _chance(self, covariance, c):
+        """Probability that the evidence for a deviation of the keys ``c`` suffices."""
+        own = self._engine.narrow[c]
+        values, vectors = np.linalg.eigh(
+            np.linalg.inv(covariance[np.ix_(c, c)]) - np.diag(own**-2))
+        null = (vectors / np.maximum(values, 1e-9 * own.min()**-2)) @ vectors.T + np.diag(own**2)
+        wide = null + np.diag(self._engine.typical[c]**2)
+        z = np.random.default_rng(0).multivariate_normal(np.zeros(len(c)), wide, SAMPLES)
+        gain = multivariate_normal.logpdf(z, cov=wide) - multivariate_normal.logpdf(z, cov=null)
+        return (gain > self._least).mean()
 
 
 def grams_of(engine: Engine, solution: Solution, flight: Any) -> np.ndarray:
@@ -281,20 +244,19 @@ class Planner:
             poses = own.poses(seed, level=starts is None)
             flight = self._flown(engine, poses, plants[0])
             if flight is not None and flight.usable:
-                information = outlook.information(grams_of(engine, solution, flight))
-                found.append((outlook.value(information), seed, poses, information))
-        for _, _, poses, information in sorted(found, reverse=True):
+                chances = outlook.chances(grams_of(engine, solution, flight))
+                found.append((float(outlook.weights @ chances[:, 0]), seed, poses, chances))
+        for _, _, poses, chances in sorted(found, reverse=True):
             if all(own.flown(poses, plant) is not None for plant in plants[1:]):
-                return {'next_flight': self._written(outlook, information, poses, starts is None)}
+                return {'next_flight': self._written(outlook, chances, poses, starts is None)}
         return _without('no random poses keep their margins with all candidates')
 
     def _flown(self, engine, poses, plant):
         """A flight of poses with a plant, exact without one; None if it cannot be used."""
         own, like = self.experiments, engine.flights[0]
         if plant is None:
-            position, yaw = own.level_motion(poses, like.period)
-            level = flat_flight(like, position, yaw)
-            return level if own.is_gentle(level._thrust({})[0], position) else None
+            level = flat_flight(like, *own.level_motion(poses, like.period))
+            return level if own.is_gentle(level._thrust({})[0]) else None
         log_ = own.flown(poses, plant)
         try:
             recording = log_ and prepare(recording_of(log_, 'next flight'), self.robot, self.p)
@@ -306,10 +268,9 @@ class Planner:
         flight.modules, flight.starts, flight.tangents = like.modules, like.starts, like.tangents
         return flight
 
-    def _written(self, outlook, information, poses, level):
+    def _written(self, outlook, chances, poses, level):
         """Write a task; what it is expected to decide."""
         own, path = self.experiments, self.path
-        chances = outlook.chances(information)
         right, wrong = outlook.weights @ chances
         question = outlook.question.replace('_', ' ')
         sentence = f'{path}: {own.duration:.0f} s, {question} with a probability of {right:.2f}'
