@@ -44,8 +44,8 @@ class Experiments:
     @staticmethod
     def poses(seed: int, level: bool) -> np.ndarray:
         """(N, 6) x, y, z [m], roll, pitch, yaw [deg] from a seed."""
-        count = (DURATION - POSE_DURATION) // STEP if level else DURATION // POSE_DURATION
-        poses = random_poses(int(count) + level, seed).round(2)
+        step, lead = (STEP, POSE_DURATION - STEP) if level else (POSE_DURATION, 0.0)
+        poses = random_poses(round((DURATION - lead) / step), seed).round(2)
         return poses * [0.5, 0.5, 1, 0, 0, 1] if level else poses
 
     def flown(self, poses: np.ndarray, plant: RobotParameters) -> FlightLog | None:
