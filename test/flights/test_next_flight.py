@@ -1,5 +1,6 @@
 """The next flight: what measurements are expected to decide, and flights that follow a motion."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -7,7 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
 
+from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.experiment import Experiments
+from beetle_omni_ros.identify.flights import next_flight
 from beetle_omni_ros.identify.flights.evidence import Judge, log_prior, normal
 from beetle_omni_ros.identify.flights.flat import flat_flight
 from beetle_omni_ros.identify.flights.keys import Entry
@@ -19,7 +22,9 @@ from beetle_omni_ros.identify.flights.next_flight import (
     Sight,
 )
 from beetle_omni_ros.identify.flights.spectrum import spectrum
-from beetle_omni_ros.identify.flights.verdict import load_tables
+from beetle_omni_ros.identify.flights.table_flight import TableFlight
+from beetle_omni_ros.identify.flights.verdict import judged_tables, load_tables
+from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.identify.recording.table import Format
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import share_path
@@ -76,6 +81,43 @@ def test_after_a_decision_there_is_no_task(verdict, tmp_path):
     assert found['sentence'].startswith(f'{verdict}: there is nothing to decide')
 
 
+def test_the_most_decisive_poses_that_keep_their_margins_with_all_candidates_are_written(
+        monkeypatch, tmp_path):
+    view, own = outlook(), hypotheses()
+    sizes = {4: 1.0, 5: 3.0, 6: 4.0, 7: None}       # seed -> information; None: margin lost
+    monkeypatch.setattr(next_flight, 'hypotheses_of', lambda engine, solution: own)
+    monkeypatch.setattr(next_flight, 'Outlook', lambda *_: view)
+    monkeypatch.setattr(next_flight, 'plant_of', lambda engine, solution, one, *_: one.label)
+    monkeypatch.setattr(next_flight, 'grams_of', lambda engine, solution, flight: [
+        gram([flight.size, -flight.size, 0, 0])])
+    monkeypatch.setattr(Planner, '_flown', lambda self, engine, poses, plant: None if sizes[
+        poses[0, 0]] is None else SimpleNamespace(usable=plant == 'a', size=sizes[poses[0, 0]]))
+    written = {}
+    experiments = SimpleNamespace(
+        duration=56.0, poses=lambda seed, level: np.full((1, 6), seed),
+        flown=lambda poses, plant: None if (poses[0, 0], plant) == (6, 'b') else 'a log',
+        write=lambda path, poses, level, head: written.update(poses=poses, level=level, head=head))
+    found = Planner(None, None, experiments, tmp_path / 'next.yaml')(
+        SimpleNamespace(flights=[0]), None, {'verdict': 'named_set'}, starts={})['next_flight']
+    assert found['poses'] == written['poses'].tolist() == [[5.0] * 6]
+    right = view.chances([gram([3.0, -3.0, 0, 0])])
+    assert found['probability'] == pytest.approx(right[:, 0].mean())
+    assert [each['name'] for each in found['hypotheses']] == ['a', 'b']
+    assert found['sentence'] in written['head'] and not written['level']
+
+
+def test_an_undecided_flight_of_a_table_is_followed_by_level_poses(crazyflie, tmp_path):
+    robot, path = crazyflie.robot, tmp_path / 'next.yaml'
+    table = replace(crazyflie.table, values={
+        name: rows[:len(crazyflie.time) // 3] for name, rows in crazyflie.table.values.items()})
+    short = TableFlight(table, robot, crazyflie.body, crazyflie.keys)
+    found = judged_tables([short], [], robot, GapParameters.load(None), Format.load('nanobench'),
+                          then=Planner(robot, None, Experiments(robot), path))
+    assert found['verdict'] == 'not_decidable'
+    assert 0.2 < found['next_flight']['probability'] < 0.8
+    assert make_task(str(path)).duration == pytest.approx(56.0)
+
+
 def test_a_flight_of_level_rotors_obeys_the_body_equations(crazyflie):
     position, yaw = Experiments.level_motion(
         Experiments.poses(0, level=True), crazyflie.period)
@@ -91,7 +133,6 @@ def test_a_flight_of_level_rotors_obeys_the_body_equations(crazyflie):
 
 @pytest.fixture(scope='module')
 def crazyflie():
-
     robot = RobotParameters.load(share_path('params') / 'crazyflie.yaml')
     path = sorted((Path(__file__).parents[1] / 'data/nanobench').glob('*.csv.gz'))[0]
     return load_tables([path], robot, Format.load('nanobench'))[0]
@@ -108,7 +149,8 @@ def test_an_effect_is_named_with_the_probability_that_its_evidence_suffices():
         names=names, narrow=np.array([0.01, 1e-6]), typical=np.array([0.3, 0.3]), alpha=0.05,
         flight=np.zeros(2), entries=[Entry(name, (name,)) for name in names],
         indices=lambda chosen: list(chosen))
-    sight = Sight(engine, SimpleNamespace(spectra=[found]), ['one'])
+    sight = Sight(engine, SimpleNamespace(spectra=[found]), ['one', 'of a balance'])
+    assert sight.labels == ['one']
     more = [gram([30.0, 0.0])]
     info = found.grams()[0].sum(axis=(0, 1))[0, 0] + sight.information(more)[0, 0]
     null = 1 / info + 0.01**2

@@ -156,10 +156,14 @@ class Sight(Gain):
         self._info = normal(solution.spectra, engine.names, engine.flight).info
         count = len(engine.entries)
         self._least = log(1 / engine.alpha) + log_prior(0, count) - log_prior(1, count)
-        self.labels, self.weights = list(names), np.full(len(names), 1 / len(names))
-        self.question = f'names one of {len(names)} effects of typical size that are hidden now,'
-        self._keys = [[engine.indices((k,)) for k, entry in enumerate(engine.entries)
-                       if entry.name == name and not entry.varying] for name in names]
+        keys = {name: [engine.indices((k,)) for k, entry in enumerate(engine.entries)
+                       if entry.name == name and not entry.varying] for name in names}
+        # the balance of torques has entries of its own
+        self._keys = {name: own for name, own in keys.items() if own}
+        self.labels = list(self._keys)
+        self.weights = np.full(len(self.labels), 1 / len(self.labels))
+        self.question = f'names one of {len(self.labels)} effects of typical size that are ' \
+                        'hidden now,'
 
     def chances(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """(H, 2) probability that each effect is named if it is there, and 0."""
@@ -169,7 +173,7 @@ class Sight(Gain):
             + np.eye(len(narrow))) * narrow
         # of an effect with several entries, that of the clearest one
         return np.array([[max(self._chance(covariance, c) for c in entries), 0.0]
-                         for entries in self._keys])
+                         for entries in self._keys.values()])
 
     def _chance(self, covariance, c):
         """Probability that the evidence for a deviation of the keys ``c`` suffices."""
