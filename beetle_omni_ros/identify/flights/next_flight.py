@@ -161,7 +161,7 @@ class Sight(Gain):
         # the balance of torques has entries of its own
         self._keys = {name: own for name, own in keys.items() if own}
         self.labels = list(self._keys)
-        self.weights = np.full(len(self.labels), 1 / len(self.labels))
+        self.weights = np.full(len(self.labels), 1 / max(len(self.labels), 1))
         self.question = f'names one of {len(self.labels)} effects of typical size that are ' \
                         'hidden now,'
 
@@ -239,6 +239,8 @@ class Planner:
         own, hypotheses = self.experiments, hypotheses_of(engine, solution)
         outlook = Outlook(engine, solution, hypotheses) if hypotheses else Sight(
             engine, solution, result['hidden'] or [r['name'] for r in result['candidates'][:MOST]])
+        if not outlook.labels:
+            return _without('the effects that are hidden show only in means of torques')
         plants = [None] if starts is None else [
             plant_of(engine, solution, each, self.robot, starts)
             for each in hypotheses[:SIMULATED]] or [weak(self.robot)]
