@@ -84,7 +84,7 @@ def test_after_a_decision_there_is_no_task(verdict, tmp_path):
 def test_the_most_decisive_poses_that_keep_their_margins_with_all_candidates_are_written(
         monkeypatch, tmp_path):
     view, own = outlook(), hypotheses()
-    sizes = {4: 1.0, 5: 3.0, 6: 4.0, 7: None}       # seed -> information; None: margin lost
+    sizes = {3: 3.0, 4: 4.0, 5: None}       # seed -> information; None: margin lost
     monkeypatch.setattr(next_flight, 'hypotheses_of', lambda engine, solution: own)
     monkeypatch.setattr(next_flight, 'Outlook', lambda *_: view)
     monkeypatch.setattr(next_flight, 'plant_of', lambda engine, solution, one, *_: one.label)
@@ -95,11 +95,11 @@ def test_the_most_decisive_poses_that_keep_their_margins_with_all_candidates_are
     written = {}
     experiments = SimpleNamespace(
         duration=56.0, poses=lambda seed, level: np.full((1, 6), seed),
-        flown=lambda poses, plant: None if (poses[0, 0], plant) == (6, 'b') else 'a log',
+        flown=lambda poses, plant: None if (poses[0, 0], plant) == (4, 'b') else 'a log',
         write=lambda path, poses, level, head: written.update(poses=poses, level=level, head=head))
     found = Planner(None, None, experiments, tmp_path / 'next.yaml')(
         SimpleNamespace(flights=[0]), None, {'verdict': 'named_set'}, starts={})['next_flight']
-    assert found['poses'] == written['poses'].tolist() == [[5.0] * 6]
+    assert found['poses'] == written['poses'].tolist() == [[3.0] * 6]
     right = view.chances([gram([3.0, -3.0, 0, 0])])
     assert found['probability'] == pytest.approx(right[:, 0].mean())
     assert [each['name'] for each in found['hypotheses']] == ['a', 'b']

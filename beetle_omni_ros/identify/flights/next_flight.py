@@ -40,7 +40,7 @@ MOST = 5                # hypotheses that are compared
 SIMULATED = 2           # of these, the most probable ones are plants of the check of the task
 SAMPLES = 4000          # of measurements of each hypothesis
 FAINT = 1e-4            # information in units of the priors that does not count
-TASKS = 4               # sequences of random poses of which the best is written
+TASKS = 3               # sequences of random poses of which the best is written
 
 
 @dataclass(frozen=True, eq=False)
