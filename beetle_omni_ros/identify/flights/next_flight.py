@@ -280,7 +280,7 @@ class Planner:
         right, wrong = outlook.weights @ chances
         question = outlook.question.replace('_', ' ')
         sentence = f'{path}: {own.duration:.0f} s, {question} with a probability of {right:.2f}'
-        sentence += f', and wrongly with {wrong:.2f}' if wrong else ''
+        sentence += f', and wrongly with {wrong:.2f}' if wrong >= 0.005 else ''
         own.write(path, poses, level, f'Written by beetle_omni gap --next.\n{sentence}.')
         return {'task': str(path), 'sentence': sentence, 'poses': poses.tolist(),
                 'probability': float(right), 'wrong': float(wrong), 'hypotheses': [
