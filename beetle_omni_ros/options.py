@@ -68,9 +68,9 @@ def whole(param: CallbackParam, text: str | None) -> list[int] | None:
 ControllerOption = Annotated[str, Option(
     '--controller', '--controllers', metavar='NAME', help=f'The active controller: {KNOWN}.')]
 TaskOption = Annotated[str, Option(metavar='TASK', help=(
-    'CSV file of poses, YAML file of set points, or waypoints, randomN (random100), lemniscate, '
-    'lemniscate_large, hover, force, force_down, force_up, torque, torque_pulses, wind, pushes, '
-    'payload or steps.'))]
+    'CSV or YAML file of poses, YAML file of set points, or waypoints, randomN (random100), '
+    'lemniscate, lemniscate_large, hover, force, force_down, force_up, torque, torque_pulses, '
+    'wind, pushes, payload or steps.'))]
 ConditionsOption = Annotated[str, Option(
     callback=one_of, metavar='|'.join(CONDITIONS), help=(
         "nominal: the simulator with the measured parameters; published: with the publication's "

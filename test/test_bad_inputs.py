@@ -44,7 +44,8 @@ FLY, FAULTS, JOINT = 'fly --bag new --task good.csv', 'faults --only mocap_lost'
 CASES = {
     f'{EVALUATE} --task': [
         ("''", "--task '': expected"), ('wayponts', "'wayponts': expected a CSV file"),
-        ('random0', "'random0': expected a CSV file of poses, a YAML file of set points, random1"),
+        ('random0', "'random0': expected a CSV file of poses, a YAML file of poses or set points, "
+                    'random1'),
         ('none.csv', 'none.csv: no such file'), ('folder', 'folder: '),
         ('no_header.csv', 'row 1: the header is missing; expected x_m'),
         ('twice.csv', "column 'x_m' occurs twice; expected"),

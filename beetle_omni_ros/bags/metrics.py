@@ -23,8 +23,8 @@ from beetle_omni_ros.control.tasks import (
     GROUND_HEIGHT,
     make_task,
     POSE_DURATION,
-    SET_POINT_FILES,
     Task,
+    TASK_FILES,
 )
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.mode import DISARMED, FALLBACK, LANDING, MOTORS_OFF, STOPPED
@@ -79,7 +79,7 @@ def metrics_by_controller(log: FlightLog, task: Task | None = None) -> dict[str,
 def task_of(log: FlightLog) -> Task | None:
     """Make the named task in a log's metadata; None for files and flights without a task."""
     name = str(log.meta.get('task', ''))
-    if not name or name.lower().endswith(('.csv', *SET_POINT_FILES)):
+    if not name or name.lower().endswith(TASK_FILES):
         return None
     try:
         return make_task(name, int(log.meta.get('seed') or 0))

@@ -22,6 +22,7 @@ from beetle_omni_ros.model.schema import (
 
 OLDEST, AHEAD = 10.0, 1.0   # [s] a stamp may be before and after the present time
 START = (0.0, 0.0, 1.0)     # [m] position after the take-off
+YAML_FILES = '.yaml', '.yml'
 COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
 
 
@@ -124,12 +125,13 @@ class TargetChecks:
 
 def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
     """
-    Read a pose file with the header ``x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg``.
+    Read a pose file with the header ``x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg``, or YAML.
 
-    Blank lines and spaces around fields are ignored; columns may be in any order.
+    Blank lines and spaces around fields are ignored; columns may be in any order. In YAML, the key
+    ``poses`` has rows in the order of this header.
 
     Args:
-        path: CSV file.
+        path: CSV file, or YAML file.
         reach: largest step between poses, and from the take-off to the first pose [m].
 
     Returns:
@@ -139,6 +141,13 @@ def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
         ParameterError: unusable file; names file, row (as in an editor), column and expectation.
 
     """
+    if str(path).lower().endswith(YAML_FILES):
+        poses = _rows(path, 'poses', COLUMNS, 1)
+        for k, pose in enumerate(poses):
+            if reason := _unusable(pose):
+                raise ParameterError(f'{path}: poses[{k}]{reason}')
+        check_steps(poses, reach, lambda k: f'{path}: poses[{k}]')
+        return poses
     columns, rows = read_table(path, _columns, ','.join(COLUMNS), check=_unusable)
     if not len(rows):
         raise ParameterError(f'{path}: no pose below the header; expected at least one row')
@@ -181,15 +190,9 @@ def read_set_points(path: str | Path, period: float
     """
     from scipy.interpolate import CubicSpline  # would double the time to start
     from scipy.spatial.transform import Rotation, RotationSpline
-    content = read_yaml(path)
-    if not isinstance(content, dict) or 'set_points' not in content:
-        raise ParameterError(f"{path}: expected the key 'set_points'")
-    rows = numbers(content['set_points'], f'{path}: set_points',
-                   dict.fromkeys(('low', 'high', 'unit')))
-    if rows.ndim != 2 or rows.shape[1] != 1 + len(COLUMNS) or len(rows) < 3 \
-            or rows[0, 0] != 0 or not (np.diff(rows[:, 0]) > 0).all():
-        raise ParameterError(f'{path}: set_points: expected at least 3 rows [time, x, y, z, roll, '
-                             'pitch, yaw] with times that increase from 0')
+    rows = _rows(path, 'set_points', ('time_s', *COLUMNS), 3)
+    if rows[0, 0] != 0 or not (np.diff(rows[:, 0]) > 0).all():
+        raise ParameterError(f'{path}: set_points: expected times that increase from 0')
     times = np.linspace(0.0, rows[-1, 0], max(round(rows[-1, 0] / period), 2) + 1)
     positions = CubicSpline(rows[:, 0], rows[:, 1:4], bc_type='clamped')(times)
     turns = Rotation.from_euler('xyz', rows[:, 4:], degrees=True)
@@ -198,6 +201,24 @@ def read_set_points(path: str | Path, period: float
         if reason := _checks().why_not_pose(*pose):
             raise ParameterError(f'{path}: at {time:.4g} s: {reason}')
     return times, positions, quaternions
+
+
+def has_poses(path: str | Path) -> bool:
+    """Whether a YAML file of a task lists poses to hold, and no set points of a trajectory."""
+    content = read_yaml(path)
+    return isinstance(content, dict) and 'poses' in content
+
+
+def _rows(path, key, columns, least):
+    """Rows of numbers (N, width) of a YAML file's ``key``."""
+    content = read_yaml(path)
+    if not isinstance(content, dict) or key not in content:
+        raise ParameterError(f"{path}: expected the key 'poses' or 'set_points'")
+    rows = numbers(content[key], f'{path}: {key}', dict.fromkeys(('low', 'high', 'unit')))
+    if rows.ndim != 2 or rows.shape[1] != len(columns) or len(rows) < least:
+        raise ParameterError(f"{path}: {key}: expected rows [{', '.join(columns)}], at least "
+                             f'{least}, found numbers of shape {rows.shape}')
+    return rows
 
 
 def _columns(header):

@@ -11,7 +11,7 @@ import re
 import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
-from beetle_omni_ros.control.targets import read_poses, read_set_points
+from beetle_omni_ros.control.targets import has_poses, read_poses, read_set_points, YAML_FILES
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.schema import ParameterError
 
@@ -92,7 +92,7 @@ SAMPLE_PERIOD = 0.02  # [s] between the samples of the published trajectory
 
 NAMES = ('waypoints', 'random100', *TILTS, 'hover', *RISING, 'wind', 'pushes', 'payload',
          'steps')
-SET_POINT_FILES = ('.yaml', '.yml')
+TASK_FILES = '.csv', *YAML_FILES
 WITH_WRENCHES = ('force', 'torque', 'wind', 'pushes')  # kinds of tasks
 
 
@@ -204,8 +204,8 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
     Make a task from its name or from a file of poses or set points.
 
     Args:
-        name: one of ``NAMES``, ``randomN`` for N random poses, or the path of a CSV file of poses
-            or of a YAML file of set points.
+        name: one of ``NAMES``, ``randomN`` for N random poses, or the path of a CSV or YAML file
+            of poses or of a YAML file of set points.
         seed: seed of the random poses.
         reach: largest step between two poses of a file for the controller [m].
 
@@ -240,12 +240,12 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
             if segment.duration]
         begin = Segment(POSE_DURATION, partial(pose_target, DISTURBED))
         return Task(name, kind, (begin, *segments), DISTURBED[None])
-    if name.lower().endswith(SET_POINT_FILES):
+    if name.lower().endswith(YAML_FILES) and not has_poses(name):
         return trajectory_task(name, *read_set_points(name, SAMPLE_PERIOD))
-    if name.lower().endswith('.csv') or name and Path(name).exists():
+    if name.lower().endswith(TASK_FILES) or name and Path(name).exists():
         return _pose_task(name, read_poses(name, reach))
-    raise ParameterError(f"task '{name}': expected a CSV file of poses, a YAML file of set "
-                         f"points, random1 to random999999 or one of {', '.join(NAMES)}")
+    raise ParameterError(f"task '{name}': expected a CSV file of poses, a YAML file of poses "
+                         f"or set points, random1 to random999999 or one of {', '.join(NAMES)}")
 
 
 def random_poses(count: int, seed: int | np.random.Generator) -> np.ndarray:

@@ -1,19 +1,15 @@
-"""
-Flights for the gap finder: manoeuvres of `gap --next`, and both robot files of `improve`.
+"""Flights for the gap finder: random poses of `gap --next`, and both robot files of `improve`."""
 
-Each manoeuvre lasts one block of the gap finder. It begins and ends at rest at one pose, so that
-any sequence of manoeuvres is a task, and the information of its blocks adds up.
-"""
-
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.bags.log import FlightLog
-from beetle_omni_ros.control.tasks import POSE_DURATION, trajectory_task
+from beetle_omni_ros.bags.metrics import metrics
+from beetle_omni_ros.bags.task_metrics import U_WINDOW
+from beetle_omni_ros.control.tasks import POSE_DURATION, poses_task, random_poses, Task
 from beetle_omni_ros.flight.campaign import Store, sweep
 from beetle_omni_ros.flight.compare import ComparedFlight, fly_flight
 from beetle_omni_ros.flight.evaluate import fly
@@ -23,143 +19,85 @@ from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import RunError
 from beetle_omni_ros.show.page import Grid, number
 
-DURATION = 8.0          # [s] of a manoeuvre
-LONGEST = 60.0          # [s] of a task, with the hover before its manoeuvres
-START = (0.0, 0.0, 1.2, 0.0, 0.0, 0.0)      # pose between manoeuvres [m], [rad]
-PERIOD, SAMPLE = 0.1, 0.02      # [s] between set points, and between the points that are flown
-RAMP = 2.0              # [s] from rest to full amplitude
+DURATION = 56.0         # [s] of a task
+STEP = 1.6              # [s] of a move between level poses
+PERIOD = 0.1            # [s] between their set points
 CONTROLLER = 'nmpc'
-# Margins of a flight. A loaded pack gives less thrust than a full one, and gusts need some.
-MOST_THRUST = 0.9       # of the largest thrust
-MOST_TILT = 0.95        # of the range of the joints
-MOST_RATE = 0.95        # of the largest rate of a joint; faster ones are taken for a limit
+# Margins. A loaded pack gives less thrust than a full one, and gusts need some.
+MOST_THRUST = 0.9       # of the largest thrust, while a pose is held
 LEAST_HEIGHT = 0.35     # [m] of base_link; the feet are 0.16 m below
-MOST_ERROR = 0.5        # [m] from the target
-
-
-def _held(axis: int, size: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Go to an offset, stay, return."""
-    return lambda t: _on(axis, size * _window(t))
-
-
-def _swung(axis: int, size: float, frequency: float, last: float | None = None
-           ) -> Callable[[np.ndarray], np.ndarray]:
-    """Sine whose frequency rises to ``last`` [Hz]."""
-    rise = ((last or frequency) - frequency) / (2 * DURATION)
-    return lambda t: _on(axis, size * _window(t) * np.sin(
-        2 * np.pi * (frequency + rise * t) * t))
-
-
-def _window(t):
-    """(N,) from 0 to 1 and back to 0, with continuous jerk."""
-    s = np.clip(np.minimum(t, DURATION - t) / RAMP, 0, 1)
-    return s**4 * (35 - 84 * s + 70 * s**2 - 20 * s**3)
-
-
-def _on(axis, values):
-    offset = np.zeros((len(values), 6))
-    offset[:, axis] = values
-    return offset
-
-
-# Name -> offset (N, 6) from START over time (N,): x, y, z [m], roll, pitch, yaw [rad].
-X, Y, Z, ROLL, PITCH, YAW = range(6)
-MANOEUVRES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    'hover at 0.5 m': _held(Z, -0.7),
-    'passes along x': _swung(X, 1.2, 0.3),
-    'passes along y': _swung(Y, 1.2, 0.3),
-    'climbs': _swung(Z, 0.5, 0.4),
-    'chirp along x': _swung(X, 0.05, 0.3, 2.0),
-    'chirp along z': _swung(Z, 0.04, 0.3, 2.0),
-    'roll 90 deg': _held(ROLL, np.pi / 2),
-    'roll 180 deg': _held(ROLL, np.pi),
-    'pitch 80 deg': _held(PITCH, np.radians(80)),
-    'yaw 180 deg': _held(YAW, np.pi),
-    'roll swings': _swung(ROLL, 0.7, 0.5),
-    'pitch swings': _swung(PITCH, 0.7, 0.5),
-    'yaw swings': _swung(YAW, 0.9, 0.5),
-    'roll chirp': _swung(ROLL, 0.2, 0.4, 2.0),
-    'pitch chirp': _swung(PITCH, 0.2, 0.4, 2.0),
-    'yaw chirp': _swung(YAW, 0.25, 0.4, 2.0),
-}
-LEVEL = tuple(name for name in MANOEUVRES if name.split()[0] not in ('roll', 'pitch', 'chirp'))
 
 
 class Experiments:
-    """Flights of manoeuvres by the simulator."""
+    """
+    Random poses as tasks of one robot.
 
-    names = tuple(MANOEUVRES)
-    level = LEVEL           # those of a robot whose rotors do not tilt
+    If its rotors tilt, it flies to each pose and holds it, as in the task ``randomN``. If not, it
+    flies through level poses, after 8 s at the first one.
+    """
+
     duration = DURATION
-    most = int((LONGEST - POSE_DURATION) / DURATION)
-    lead = POSE_DURATION
 
     def __init__(self, robot: RobotParameters):
         self._robot = robot
 
-    def flown(self, names: Sequence[str], plant: RobotParameters | None = None
-              ) -> FlightLog | None:
-        """Fly manoeuvres one after the other with a plant, by default the robot; None: a crash."""
-        times, poses = set_points(names, SAMPLE)
-        task = trajectory_task('next flight', times, poses[:, :3], Rotation.from_euler(
-            'xyz', poses[:, 3:]).as_quat())
+    @staticmethod
+    def poses(seed: int, level: bool) -> np.ndarray:
+        """(N, 6) x, y, z [m], roll, pitch, yaw [deg] from a seed."""
+        step, lead = (STEP, POSE_DURATION - STEP) if level else (POSE_DURATION, 0.0)
+        poses = random_poses(round((DURATION - lead) / step), seed).round(2)
+        return poses * [0.5, 0.5, 1, 0, 0, 1] if level else poses
+
+    def flown(self, poses: np.ndarray, plant: RobotParameters) -> FlightLog | None:
+        """Fly poses with a plant in the simulator; None if a margin is lost."""
+        task = poses_task('next flight', poses)
         try:
-            log = fly(CONTROLLER, task, robot=self._robot, plant=plant or self._robot)
+            log = fly(CONTROLLER, task, robot=self._robot, plant=plant)
         except RunError:
             return None
-        return None if log.meta['crashed'] else log
+        return log if self.is_safe(log, task) else None
 
-    def why_unsafe(self, names: Sequence[str], log: FlightLog) -> dict[str, str]:
-        """Manoeuvres without margin to a limit, each with the first one that it reaches."""
-        joints, rotors = self._robot.joints, self._robot.rotors
-        times, poses = set_points(names, SAMPLE)
-        begin = log.begin + POSE_DURATION
-        series, tilt = log.truth, log.joint.position
-        wanted = np.stack([np.interp(series.t - begin, times, poses[:, k]) for k in range(3)], 1)
-        rate = np.abs(np.gradient(tilt, log.joint.t, axis=0)).max(axis=1)
-        checks = (
-            ('thrust', log.command.t, log.command.thrust.max(axis=1)
-             > MOST_THRUST * rotors.thrust_max),
-            ('range of the joints', log.joint.t, np.abs(tilt).max(axis=1)
-             > MOST_TILT * joints.position_limit),
-            ('rate of the joints', log.joint.t, rate > MOST_RATE * joints.velocity_limit),
-            ('height', series.t, series.position[:, 2] < LEAST_HEIGHT),
-            ('distance from the target', series.t, np.linalg.norm(
-                series.position - wanted, axis=1) > MOST_ERROR),
-            ('state', log.state_t, np.array([mode.state != FLYING for mode in log.states])))
-        found: dict[str, str] = {}
-        for what, t, beyond in checks:
-            places = np.floor((t[beyond] - begin) / DURATION).astype(int)
-            for k in np.unique(places[(places >= 0) & (places < len(names))]):
-                found.setdefault(names[k], what)
-        return found
+    def is_safe(self, log: FlightLog, task: Task) -> bool:
+        """Whether each pose is reached, with margins of thrust and height, by the controller."""
+        held = (log.command.t - log.begin) % POSE_DURATION >= U_WINDOW[0]
+        thrust = log.command.thrust[held & (log.command.t >= log.begin)]
+        height = log.truth.position[log.truth.t >= log.begin, 2]
+        return metrics(log, task)['success_rate'] == 1 and self.is_gentle(thrust) \
+            and height.min() >= LEAST_HEIGHT and all(mode.state == FLYING for t, mode in zip(
+                log.state_t, log.states, strict=True) if t > log.begin)
+
+    def is_gentle(self, thrust: np.ndarray) -> bool:
+        """Whether thrusts (N, 4) [N] keep a margin."""
+        return bool(thrust.max() <= MOST_THRUST * self._robot.rotors.thrust_max)
 
     @staticmethod
-    def level_motion(names: Sequence[str], period: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, 3) [m] and yaw (N,) [rad], from a start on the ground."""
-        _, poses = set_points(names, period)
-        rise = np.zeros((round(POSE_DURATION / period), 6))
-        rise[:, 2] = START[2] * _window(period * np.arange(len(rise)) * 0.5)
-        poses = np.concatenate([rise, poses])
-        return poses[:, :3], poses[:, 5]
+    def level_motion(poses: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (N, 3) [m] and yaw (N,) [rad] of moves between poses, from the ground."""
+        ground = poses[0] * [1, 1, 0, 0, 0, 1]
+        rise = POSE_DURATION / 2 * np.arange(2)
+        motion = _moved([*rise, *(POSE_DURATION + STEP * np.arange(len(poses)))],
+                        np.vstack([ground, poses[0], poses]), period)
+        return motion[:, 1:4], np.radians(motion[:, 6])
 
     @staticmethod
-    def write(path: Path, names: Sequence[str], head: str) -> None:
-        """Write the set points of manoeuvres as a task; ``head`` are lines of comment."""
-        times, poses = set_points(names, PERIOD)
-        rows = np.column_stack([times, poses[:, :3], np.degrees(poses[:, 3:])])
-        lines = [f"- [{', '.join(f'{value:.5g}' for value in row + 0.0)}]" for row in rows]
-        text = '\n'.join(f'# {line}'.rstrip() for line in [
-            *head.splitlines(), 'Rows: time [s], x, y, z [m], roll, pitch, yaw [deg].'])
-        write_text(path, f'{text}\nset_points:\n' + '\n'.join(lines) + '\n', 'task')
+    def write(path: Path, poses: np.ndarray, level: bool, head: str) -> None:
+        """Write poses as a task; ``head`` are lines of comment."""
+        key, columns, rows = ('set_points', 'time [s], ', _moved(
+            STEP * np.arange(len(poses)), poses, PERIOD)) if level else ('poses', '', poses)
+        lines = [*(f'# {line}' for line in head.splitlines()),
+                 f'# Rows: {columns}x, y, z [m], roll, pitch, yaw [deg].', f'{key}:',
+                 *(f"- [{', '.join(f'{value:.5g}' for value in row + 0.0)}]" for row in rows)]
+        write_text(path, '\n'.join([*lines, '']), 'task')
 
 
-def set_points(names: Sequence[str], period: float) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) times [s] and (N, 6) poses [m], [rad] of manoeuvres."""
-    count = round(DURATION / period)
-    t = period * np.arange(count)
-    offsets = np.concatenate([*(MANOEUVRES[name](t) for name in names), np.zeros((1, 6))])
-    return period * np.arange(len(offsets)), np.array(START) + offsets
+def _moved(times, poses, period):
+    """Set points (N, 7), time [s] and pose: moves from rest to rest with continuous jerk."""
+    times = np.asarray(times)
+    t = period * np.arange(round(times[-1] / period) + 1)
+    k = np.clip(np.searchsorted(times, t, side='right') - 1, 0, len(times) - 2)
+    s = ((t - times[k]) / (times[k + 1] - times[k]))[:, None]
+    share = s**4 * (35 - 84 * s + 70 * s**2 - 20 * s**3)
+    return np.column_stack([t, poses[k] + share * (poses[k + 1] - poses[k])])
 
 
 # --- flights with the file before and with the corrected one -------------------------------------

@@ -151,13 +151,27 @@ def test_set_points_are_a_trajectory_through_each_of_them(tmp_path):
         assert (turn.inv() * Rotation.from_quat(target.quaternions[k])).magnitude() < 1e-6
 
 
+def test_poses_in_yaml_are_those_of_the_same_csv(tmp_path):
+    yaml, csv = tmp_path / 'poses.YAML', tmp_path / 'poses.csv'
+    yaml.write_text('poses:\n- [1, 2, 0.8, -5, 6.5, 90]\n- [0, 0, 1, 0, 0, 0]\n')
+    csv.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n1,2,0.8,-5,6.5,90\n0,0,1,0,0,0\n')
+    tasks = [make_task(str(path)) for path in (yaml, csv)]
+    assert tasks[0].poses.tolist() == tasks[1].poses.tolist()
+    assert [task.duration for task in tasks] == [16.0, 16.0]
+    with pytest.raises(ParameterError, match=r'poses\[0\]: .* the reach of the controller'):
+        make_task(str(yaml), reach=2.0)
+
+
 @pytest.mark.parametrize('content, text', [
-    ('poses: []', "expected the key 'set_points'"),
-    ('set_points: [[0, 0, 0, 1]]', 'at least 3 rows'),
+    ('points: []', "expected the key 'poses' or 'set_points'"),
+    ('poses: []', 'at least 1'),
+    ('poses: [[0, 0, 1, 0, 0]]', r'shape \(1, 5\)'),
+    ('poses: [[0, 0, 1, 0, 0, 0], [0, 0, 0.1, 0, 0, 0]]', r'poses\[1\]: .*the floor'),
+    ('set_points: [[0, 0, 0, 1]]', 'at least 3, found numbers of shape'),
     ('set_points: [[0,0,0,1,0,0,0], [2,0,0,1,0,0,0], [1,0,0,1,0,0,0]]', 'increase from 0'),
     ('set_points: [[0,0,0,1,0,0,0], [2,0,0,0.1,0,0,0], [4,0,0,1,0,0,0]]', 'the floor'),
     ('set_points: [[0,0,0,1,0,0,0], [2,99,0,1,0,0,0], [4,0,0,1,0,0,0]]', 'the fence')])
-def test_set_points_are_refused_with_the_reason(tmp_path, content, text):
+def test_a_task_in_yaml_is_refused_with_the_reason(tmp_path, content, text):
     file = tmp_path / 'points.yaml'
     file.write_text(content)
     with pytest.raises(ParameterError, match=text):

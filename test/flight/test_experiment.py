@@ -1,4 +1,4 @@
-"""Manoeuvres of the next flight: composed to a task, and their margins."""
+"""Random poses of the next flight: as tasks in files, and their margins."""
 
 from dataclasses import replace
 
@@ -6,54 +6,61 @@ import numpy as np
 import pytest
 from synthetic_flights import targets_of
 
-from beetle_omni_ros.control.tasks import make_task
-from beetle_omni_ros.flight.experiment import Experiments, MANOEUVRES, set_points, START
+from beetle_omni_ros.control.tasks import make_task, poses_task
+from beetle_omni_ros.flight import experiment
+from beetle_omni_ros.flight.experiment import Experiments
 from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
+POSES = np.array([[0.5, -0.5, 1.2, 90.0, 0.0, 30.0], [-0.5, 0.5, 0.8, 0.0, 0.0, -60.0]])
 
 
-@pytest.mark.parametrize('name', MANOEUVRES)
-def test_a_manoeuvre_moves_and_begins_and_ends_at_rest(name):
-    times, poses = set_points([name], 0.005)
-    rates = np.gradient(poses, times, axis=0)
-    assert np.abs(poses - START).max() > 0.01
-    for k in (0, -1):
-        assert poses[k] == pytest.approx(START, abs=1e-6)
-        assert rates[k] == pytest.approx(np.zeros(6), abs=1e-3)
-
-
-def test_a_written_task_is_the_motion_of_its_manoeuvres_within_60_s(tmp_path):
-    file, names = tmp_path / 'next.yaml', ['roll 180 deg', 'passes along x', 'yaw chirp'] * 2
-    Experiments.write(file, names[:Experiments.most], 'A comment.')
+def test_a_written_task_of_poses_is_flown_for_56_s(tmp_path):
+    file, poses = tmp_path / 'next.yaml', Experiments.poses(3, level=False)
+    Experiments.write(file, poses, False, 'A comment.\nAnother one.')
     task = make_task(str(file))
-    times, poses = set_points(names, 0.02)
+    assert (task.kind, task.duration) == ('poses', 56.0)
+    assert np.array_equal(task.poses, poses)
+    assert (np.abs(poses[:, 3:]).max(axis=0) > 45).all()
+    assert not np.array_equal(poses, Experiments.poses(4, level=False))
+    assert file.read_text().startswith('# A comment.\n# Another one.\n')
+
+
+def test_a_written_task_of_level_poses_is_the_expected_motion_from_rest_to_rest(tmp_path):
+    file, poses = tmp_path / 'next.yaml', Experiments.poses(3, level=True)
+    Experiments.write(file, poses, True, 'A comment.')
+    task = make_task(str(file))
+    position, yaw = Experiments.level_motion(poses, 0.02)
     target = targets_of(task, 0.0)[-1]
-    assert task.duration == pytest.approx(8.0 + 8.0 * len(names)) and task.duration <= 60.0
-    assert np.abs(target.positions - poses[:, :3]).max() < 0.002
-    assert file.read_text().startswith('# A comment.')
+    assert task.duration == pytest.approx(56.0)
+    assert np.abs(target.positions - position[400:]).max() < 0.002      # after 8 s
+    assert position[0, 2] == 0 and np.ptp(position[200:401], axis=0) == pytest.approx(0)
+    for values in (position, yaw):
+        assert np.abs(np.diff(values, axis=0)[[0, 400, 480, -1]]).max() < 1e-4
 
 
 @pytest.fixture(scope='module')
-def flown():
-    names = ('climbs', 'roll 90 deg')
-    return names, Experiments(ROBOT).flown(names)
+def log():
+    return Experiments(ROBOT).flown(POSES, ROBOT)
 
 
-def test_a_flight_keeps_its_margins_and_a_weaker_robot_loses_them_where_thrust_is_largest(flown):
-    names, log = flown
-    assert Experiments(ROBOT).why_unsafe(names, log) == {}
-    begins = log.begin + 8.0 + 8.0 * np.arange(2)
-    most = [log.command.thrust[log.command.window(t, t + 8.0)].max() for t in begins]
-    weak = replace(ROBOT, rotors=replace(ROBOT.rotors, thrust_max=float(np.mean(most)) / 0.9))
-    found = Experiments(weak).why_unsafe(names, log)
-    assert found == {names[int(np.argmax(most))]: 'thrust'}
+def test_a_flight_keeps_its_margins_unless_the_robot_is_too_weak_to_hold_a_pose(log):
+    task = poses_task('own', POSES)
+    assert Experiments(ROBOT).is_safe(log, task)
+    held = max(log.command.thrust[log.command.window(t, t + 1.0)].max()
+               for t in log.begin + np.array([7.0, 15.0]))
+    for share, safe in ((0.88, True), (0.92, False)):
+        weak = replace(ROBOT, rotors=replace(ROBOT.rotors, thrust_max=float(held) / share))
+        assert Experiments(weak).is_safe(log, task) is safe
 
 
-def test_a_manoeuvre_beyond_the_range_of_the_joints_or_away_from_its_target_is_found(flown):
-    names, log = flown
-    tight = replace(ROBOT, joints=replace(ROBOT.joints, position_limit=1.0))
-    assert Experiments(tight).why_unsafe(names, log) == {'roll 90 deg': 'range of the joints'}
-    others = ('passes along x', 'roll 90 deg')
-    assert Experiments(ROBOT).why_unsafe(others, log) == {
-        'passes along x': 'distance from the target'}
+def test_a_missed_pose_and_a_low_flight_are_found(log, monkeypatch):
+    own, other = Experiments(ROBOT), poses_task('own', POSES + [0.3, 0, 0, 0, 0, 0])
+    assert not own.is_safe(replace(log, targets=targets_of(other, log.begin)), other)
+    monkeypatch.setattr(experiment, 'LEAST_HEIGHT', 0.9)
+    assert not own.is_safe(log, poses_task('own', POSES))
+
+
+def test_a_plant_that_cannot_hold_a_pose_has_no_flight():
+    heavy = replace(ROBOT, mass=2.2 * ROBOT.mass)
+    assert Experiments(ROBOT).flown(POSES[:1], heavy) is None

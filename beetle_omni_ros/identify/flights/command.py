@@ -68,7 +68,7 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
         alpha: probability of a false alarm that is accepted.
         learn: file of an effect to write, a formula for what no entry explains.
         next_task: task to write, a flight that decides what these left open.
-        experiments: makes what flies its manoeuvres, for ``next_task``.
+        experiments: makes what draws and flies its poses, for ``next_task``.
 
     Returns:
         the results that are written as JSON.

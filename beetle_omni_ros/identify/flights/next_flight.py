@@ -1,11 +1,12 @@
 """
-The next flight: manoeuvres whose measurements answer what the flights left open.
+The next flight: random poses whose measurements answer what the flights left open.
 
 The hypotheses are sets of catalogue entries. Under hypothesis i, the keys theta have the posterior
-N(m_i, P_i) of the flights so far. Manoeuvres with the information M of all keys measure
-z = L' theta + e, where M = L L' and e is white, so that z is N(L' m_i, L' P_i L + 1). The expected
-evidence for i over j is the divergence of these two normal densities. Whatever another hypothesis,
-a tolerance, the flight or the discrepancy explains as well, it does not count.
+N(m_i, P_i) of the flights so far. A flight with the information M of all keys measures
+z = L' theta + e, where M = L L' and e is white, so that z is N(L' m_i, L' P_i L + 1). Whatever
+another hypothesis, a tolerance, the flight or the discrepancy explains as well, it does not count.
+Of some sequences of random poses, the one with the largest probability of a right answer is
+written.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from scipy.stats import multivariate_normal
 from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.evidence import log_prior, normal, Solution
+from beetle_omni_ros.identify.flights.evidence import log_prior, Normal, normal, Solution
 from beetle_omni_ros.identify.flights.flat import flat_flight
 from beetle_omni_ros.identify.flights.results import member_of, named_of, parameters, Starts
-from beetle_omni_ros.identify.flights.spectrum import blocks_of, pooled, WARM
+from beetle_omni_ros.identify.flights.spectrum import pooled
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.inference.noise import few_blocks
 from beetle_omni_ros.identify.recording.bag import recording_of
@@ -37,12 +38,9 @@ from beetle_omni_ros.model.schema import ParameterError
 OPEN = 'named_set', 'not_decidable'     # verdicts
 MOST = 5                # hypotheses that are compared
 SIMULATED = 2           # of these, the most probable ones are plants of the check of the task
-ENOUGH = 25.0           # [nat] of evidence; more is not better
-SAMPLES = 400           # of measurements of each hypothesis
+SAMPLES = 4000          # of measurements of each hypothesis
 FAINT = 1e-4            # information in units of the priors that does not count
-MOST_THRUST = 0.9       # of the largest thrust, without a simulator
-TRIALS = 3              # tasks that are checked before there is none
-Grams = dict[str, np.ndarray]       # manoeuvre -> (K, K) information of its block
+TASKS = 3               # sequences of random poses of which the best is written
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,30 +76,38 @@ def hypotheses_of(engine: Engine, solution: Solution) -> list[Explanation]:
         own = tuple(sorted({*best, j} - ({k} - {j})))
         found.append(Explanation(
             solution.entries[j].label, own, engine.gain(solution.judge, own, best),
-            *_posterior(engine, solution, equations, own)))
+            *posterior_of(engine, solution, equations, own)))
     return found
 
 
-def _posterior(engine, solution, equations, chosen):
-    """Mean and covariance of all keys, with the priors that the engine has for a set."""
+def posterior_of(engine: Engine, solution: Solution, equations: Normal,
+                 chosen: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Mean (K,) and covariance (K, K) of all keys, with the priors that the engine has for a set.
+
+    The factor of a limit that acts is one in a set that has it, not zero.
+    """
     prior = engine.narrow.copy()
     free = engine.indices((*chosen, *solution.banned))
     prior[free] = np.hypot(prior[free], engine.typical[free])
     c, _, _, _, slab = solution.judge._profile(tuple(sorted(engine.indices(chosen))))
-    prior[c] = np.where(np.isin(c, free), slab, prior[c])
+    own = np.isin(c, free)
+    prior[c] = np.where(own, slab, prior[c])
+    right = equations.right.copy()
+    right[c] += own * solution.judge.acting[c] * slab**-2
     covariance = prior[:, None] * np.linalg.inv(
         prior[:, None] * equations.info * prior + np.eye(len(prior))) * prior
-    return covariance @ equations.right, covariance
+    return covariance @ right, covariance
 
 
 class Gain:
-    """What the measurements of manoeuvres are worth."""
+    """What the measurements of a flight are worth."""
 
     def __init__(self, engine: Engine, solution: Solution):
         self._engine = engine
         self._blocks = sum(len(each.residual) for each in solution.spectra)
 
-    def information(self, grams: Sequence[np.ndarray]) -> np.ndarray:
+    def information(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """(K, K) information of blocks of one flight without what differs between flights."""
         engine, total = self._engine, np.sum(grams, axis=0)
         own = np.flatnonzero(engine.flight > 0)
@@ -110,49 +116,26 @@ class Gain:
         return total / few_blocks(engine.alpha / len(engine.entries), self._blocks + len(grams))
 
 
-
 class Outlook(Gain):
-    """What manoeuvres are expected to decide between hypotheses."""
+    """What a flight is expected to decide between hypotheses."""
 
     def __init__(self, engine: Engine, solution: Solution, hypotheses: Sequence[Explanation]):
         super().__init__(engine, solution)
-        self.hypotheses, self._scale = list(hypotheses), np.hypot(engine.narrow, engine.typical)
+        self._hypotheses, self._scale = list(hypotheses), np.hypot(engine.narrow, engine.typical)
         odds = np.array([each.odds for each in hypotheses])
         self.odds, self.weights = odds, np.exp(odds - np.logaddexp.reduce(odds))
         self.question = 'decides between ' + ' and '.join(each.label for each in hypotheses)
         self.labels = [each.label for each in hypotheses]
 
-    def measured(self, information: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Mean (r,) and covariance (r, r) of the measurements under each hypothesis."""
-        s = self._scale
-        values, vectors = np.linalg.eigh(s[:, None] * information * s)
+    def chances(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
+        """(H, 2) probability that each hypothesis, if true, is decided, and another one is."""
+        s, rng = self._scale, np.random.default_rng(0)
+        values, vectors = np.linalg.eigh(s[:, None] * self.information(grams) * s)
         keep = values > FAINT
         root = np.sqrt(values[keep]) * vectors[:, keep] / s[:, None]
-        return [(root.T @ each.mean, root.T @ each.covariance @ root + np.eye(keep.sum()))
-                for each in self.hypotheses]
-
-    def evidence(self, information: np.ndarray) -> np.ndarray:
-        """(H, H) expected ln of the probability of each hypothesis, if true, over another one."""
-        moments = self.measured(information)
-        inverses = [np.linalg.inv(covariance) for _, covariance in moments]
-        volumes = [np.linalg.slogdet(covariance)[1] for _, covariance in moments]
-        gains = self.odds[:, None] - self.odds
-        for i, (mean, covariance) in enumerate(moments):
-            for j, (other, _) in enumerate(moments):
-                away = mean - other
-                gains[i, j] += 0.5 * (np.sum(inverses[j] * covariance) - len(mean)
-                                      + away @ inverses[j] @ away + volumes[j] - volumes[i])
-        return gains
-
-    def value(self, information: np.ndarray) -> float:
-        """Mean of the evidence for the truth over its strongest rival [nat]."""
-        gains = np.minimum(self.evidence(information), ENOUGH)
-        np.fill_diagonal(gains, np.inf)
-        return float(self.weights @ gains.min(axis=1))
-
-    def chances(self, information: np.ndarray, seed: int = 0) -> np.ndarray:
-        """(H, 2) probability that each hypothesis, if true, is decided, and another one is."""
-        moments, rng = self.measured(information), np.random.default_rng(seed)
+        # mean (r,) and covariance (r, r) of the measurements under each hypothesis
+        moments = [(root.T @ each.mean, root.T @ each.covariance @ root + np.eye(keep.sum()))
+                   for each in self._hypotheses]
         least, found = log(1 / self._engine.alpha), []
         for k, (mean, covariance) in enumerate(moments):
             z = rng.multivariate_normal(mean, covariance, SAMPLES, method='cholesky')
@@ -166,95 +149,52 @@ class Outlook(Gain):
 
 
 class Sight(Gain):
-    """What manoeuvres are expected to show of single effects of typical size, if one is there."""
+    """What a flight is expected to show of single effects of typical size, if one is there."""
 
     def __init__(self, engine: Engine, solution: Solution, names: Sequence[str]):
         super().__init__(engine, solution)
         self._info = normal(solution.spectra, engine.names, engine.flight).info
         count = len(engine.entries)
         self._least = log(1 / engine.alpha) + log_prior(0, count) - log_prior(1, count)
-        self.labels, self.weights = list(names), np.full(len(names), 1 / len(names))
-        self.question = f'names one of {len(names)} effects of typical size that are hidden now,'
-        self._keys = [[engine.indices((k,)) for k, entry in enumerate(engine.entries)
-                       if entry.name == name and not entry.varying] for name in names]
+        keys = {name: [engine.indices((k,)) for k, entry in enumerate(engine.entries)
+                       if entry.name == name and not entry.varying] for name in names}
+        # the balance of torques has entries of its own
+        self._keys = {name: own for name, own in keys.items() if own}
+        self.labels = list(self._keys)
+        self.weights = np.full(len(self.labels), 1 / max(len(self.labels), 1))
+        self.question = f'names one of {len(self.labels)} effects of typical size that are ' \
+                        'hidden now,'
 
-    def _variances(self, information):
-        """For each effect, of each of its entries (d, d): of the estimate without and with it."""
-        engine, narrow = self._engine, self._engine.narrow
-        covariance = narrow[:, None] * np.linalg.inv(
-            narrow[:, None] * (self._info + information) * narrow + np.eye(len(narrow))) * narrow
-
-        def both(c):
-            values, vectors = np.linalg.eigh(
-                np.linalg.inv(covariance[np.ix_(c, c)]) - np.diag(narrow[c]**-2))
-            null = (vectors / np.maximum(values, 1e-9 * narrow[c].min()**-2)) @ vectors.T \
-                + np.diag(narrow[c]**2)
-            return null, null + np.diag(engine.typical[c]**2)
-        return [[both(c) for c in entries] for entries in self._keys]
-
-    def value(self, information: np.ndarray) -> float:
-        """Mean of the expected evidence over what is needed, at most one for each effect."""
-        return float(np.mean([min(max(_divergence(*both) for both in entries), self._least)
-                              for entries in self._variances(information)])) / self._least
-
-    def chances(self, information: np.ndarray, seed: int = 0) -> np.ndarray:
+    def chances(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """(H, 2) probability that each effect is named if it is there, and 0."""
-        rng, found = np.random.default_rng(seed), []
-        for entries in self._variances(information):
-            null, wide = max(entries, key=lambda both: _divergence(*both))
-            zero = np.zeros(len(null))
-            z = rng.multivariate_normal(zero, wide, SAMPLES)
-            gain = multivariate_normal.logpdf(z, zero, wide) - multivariate_normal.logpdf(
-                z, zero, null)
-            found.append([(gain > self._least).mean(), 0.0])
-        return np.array(found)
+        narrow = self._engine.narrow
+        covariance = narrow[:, None] * np.linalg.inv(
+            narrow[:, None] * (self._info + self.information(grams)) * narrow
+            + np.eye(len(narrow))) * narrow
+        # of an effect with several entries, that of the clearest one
+        return np.array([[max(self._chance(covariance, c) for c in entries), 0.0]
+                         for entries in self._keys.values()])
+
+    def _chance(self, covariance, c):
+        """Probability that the evidence for a deviation of the keys ``c`` suffices."""
+        own = self._engine.narrow[c]
+        values, vectors = np.linalg.eigh(
+            np.linalg.inv(covariance[np.ix_(c, c)]) - np.diag(own**-2))
+        null = (vectors / np.maximum(values, 1e-9 * own.min()**-2)) @ vectors.T + np.diag(own**2)
+        wide = null + np.diag(self._engine.typical[c]**2)
+        z = np.random.default_rng(0).multivariate_normal(np.zeros(len(c)), wide, SAMPLES)
+        gain = multivariate_normal.logpdf(z, cov=wide) - multivariate_normal.logpdf(z, cov=null)
+        return (gain > self._least).mean()
 
 
-def _divergence(null, wide):
-    """Mean ln of the evidence [nat] for a normal density with a wide variance, if it is true."""
-    ratio = np.linalg.solve(null, wide)
-    return 0.5 * float(np.trace(ratio) - len(null) - np.linalg.slogdet(ratio)[1])
-
-
-def chosen(outlook: Outlook | Sight, grams: Grams, most: int) -> list[str]:
-    """Manoeuvres, one after the other the one with which the value is largest."""
-    names: list[str] = []
-    parts: list[np.ndarray] = []
-    for _ in range(most):
-        values = {name: outlook.value(outlook.information([*parts, gram]))
-                  for name, gram in grams.items()}
-        names.append(max(values, key=values.get))       # type: ignore[arg-type]
-        parts.append(grams[names[-1]])
-    return names
-
-
-def grams_of(engine: Engine, solution: Solution, flight: Any, begin: float,
-             names: Sequence[str], duration: float) -> list[tuple[str, np.ndarray]]:
-    """
-    Information (K, K) of the block of each manoeuvre that can be used.
-
-    Args:
-        engine: with the flights so far.
-        solution: of the engine.
-        flight: as the engine's flights.
-        begin: of the first manoeuvre, in the time of the flight [s].
-        names: manoeuvres.
-        duration: of a manoeuvre [s].
-
-    """
-    end = begin + len(names) * duration
-    flight.mask &= ((flight.time >= begin - WARM) & (flight.time < end))[:, None]
-    rows = blocks_of(flight.mask & (flight.time >= begin)[:, None], flight.period)
-    if not len(rows):
-        return []
+def grams_of(engine: Engine, solution: Solution, flight: Any) -> np.ndarray:
+    """(B, K, K) information of the blocks of a flight, linearised at the fitted values."""
     theta = np.zeros(len(engine.names))
     theta[:engine.known] = solution.theta[:engine.known]
     flight.settle(dict(zip(engine.names, theta[:engine.real], strict=False)))
     [found], _ = engine.others([flight], theta)
     found.noise = pooled(solution.spectra)
-    places = np.rint((flight.time[rows[:, 0]] - begin) / duration).astype(int)
-    return [(names[k], gram) for k, gram in zip(
-        places, found.grams()[0].sum(axis=1), strict=False) if k < len(names)]
+    return found.grams()[0].sum(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +205,7 @@ class Planner:
     Args:
         robot: robot file.
         p: parameters of the gap finder.
-        experiments: simulated manoeuvres, :class:`~beetle_omni_ros.flight.experiment.Experiments`.
+        experiments: random poses, :class:`~beetle_omni_ros.flight.experiment.Experiments`.
         path: task to write.
 
     """
@@ -290,7 +230,7 @@ class Planner:
 
         Returns:
             ``next_flight``: ``task`` (None: none is written), ``sentence``, and of a written one
-            ``manoeuvres``, ``probability`` that it decides rightly and ``wrong`` that it decides
+            ``poses``, ``probability`` that it decides rightly and ``wrong`` that it decides
             wrongly, and both of each of the ``hypotheses``.
 
         """
@@ -299,60 +239,50 @@ class Planner:
         own, hypotheses = self.experiments, hypotheses_of(engine, solution)
         outlook = Outlook(engine, solution, hypotheses) if hypotheses else Sight(
             engine, solution, result['hidden'] or [r['name'] for r in result['candidates'][:MOST]])
-        names, plants = own.level, []
-        if starts is not None:
-            names, plants = own.names, [plant_of(engine, solution, each, self.robot, starts)
-                                        for each in hypotheses[:SIMULATED]] or [weak(self.robot)]
-        found, beyond = self._flown(engine, solution, names, None, starts is None)
-        grams = {name: gram for name, gram in found if name not in beyond}
-        for _ in range(TRIALS):
-            if not grams:
-                break
-            names = tuple(chosen(outlook, grams, own.most))
-            found, beyond = [(name, grams[name]) for name in names], {}
-            for plant in plants:
-                found, more = self._flown(engine, solution, names, plant)
-                beyond |= more
-            if found and not beyond:
-                return {'next_flight': self._written(outlook, [gram for _, gram in found], names)}
-            grams = {name: gram for name, gram in grams.items() if name not in beyond}
-        return _without('no manoeuvre keeps its margins with all candidates')
+        if not outlook.labels:
+            return _without('the effects that are hidden show only in means of torques')
+        plants = [None] if starts is None else [
+            plant_of(engine, solution, each, self.robot, starts)
+            for each in hypotheses[:SIMULATED]] or [weak(self.robot)]
+        found = []
+        # other poses after each flight
+        for seed in range(TASKS * len(engine.flights), TASKS * (len(engine.flights) + 1)):
+            poses = own.poses(seed, level=starts is None)
+            flight = self._flown(engine, poses, plants[0])
+            if flight is not None and flight.usable:
+                chances = outlook.chances(grams_of(engine, solution, flight))
+                found.append((float(outlook.weights @ chances[:, 0]), seed, poses, chances))
+        for _, _, poses, chances in sorted(found, reverse=True):
+            if all(own.flown(poses, plant) is not None for plant in plants[1:]):
+                return {'next_flight': self._written(outlook, chances, poses, starts is None)}
+        return _without('no random poses keep their margins with all candidates')
 
-    def _flown(self, engine, solution, names, plant, flat=False):
-        """Information of the manoeuvres of a flight, and those without margins."""
+    def _flown(self, engine, poses, plant):
+        """A flight of poses with a plant, exact without one; None if it cannot be used."""
         own, like = self.experiments, engine.flights[0]
-        if flat:
-            level = flat_flight(like, *own.level_motion(names, like.period))
-            places = ((level.time - own.lead) / own.duration).astype(int)
-            most = np.array([level._thrust({})[0][places == k].max() for k in range(len(names))])
-            return grams_of(engine, solution, level, own.lead, names, own.duration), {
-                name: 'thrust' for name, thrust in zip(names, most, strict=True)
-                if thrust > MOST_THRUST * self.robot.rotors.thrust_max}
-        log_ = own.flown(names, plant)
-        if log_ is None:
-            return [], dict.fromkeys(names, 'crash')
+        if plant is None:
+            level = flat_flight(like, *own.level_motion(poses, like.period))
+            return level if own.is_gentle(level._thrust({})[0]) else None
+        log_ = own.flown(poses, plant)
         try:
-            recording = prepare(recording_of(log_, 'next flight'), self.robot, self.p)
-        except UnusableFlight as error:
-            return [], dict.fromkeys(names, str(error))
+            recording = log_ and prepare(recording_of(log_, 'next flight'), self.robot, self.p)
+        except UnusableFlight:
+            return None
+        if not recording:
+            return None
         flight = BagFlight(recording, self.robot, like._body, like.keys, self.p)
         flight.modules, flight.starts, flight.tangents = like.modules, like.starts, like.tangents
-        begin = log_.begin + own.lead - recording.start
-        return grams_of(engine, solution, flight, begin, names, own.duration), \
-            own.why_unsafe(names, log_)
+        return flight
 
-    def _written(self, outlook, grams, names):
+    def _written(self, outlook, chances, poses, level):
         """Write a task; what it is expected to decide."""
         own, path = self.experiments, self.path
-        chances = outlook.chances(outlook.information(grams))
         right, wrong = outlook.weights @ chances
-        duration = own.lead + len(names) * own.duration
         question = outlook.question.replace('_', ' ')
-        sentence = f'{path}: {duration:.0f} s, {question} with a probability of {right:.2f}'
-        sentence += f', and wrongly with {wrong:.2f}' if wrong else ''
-        own.write(path, names, f'Written by beetle_omni gap --next.\n{sentence}.\n'
-                               f"After {own.lead:g} s of hover: {'; '.join(names)}.")
-        return {'task': str(path), 'sentence': sentence, 'manoeuvres': list(names),
+        sentence = f'{path}: {own.duration:.0f} s, {question} with a probability of {right:.2f}'
+        sentence += f', and wrongly with {wrong:.2f}' if wrong >= 0.005 else ''
+        own.write(path, poses, level, f'Written by beetle_omni gap --next.\n{sentence}.')
+        return {'task': str(path), 'sentence': sentence, 'poses': poses.tolist(),
                 'probability': float(right), 'wrong': float(wrong), 'hypotheses': [
                     {'name': label, 'weight': float(weight), 'probability': float(chance[0]),
                      'wrong': float(chance[1])} for label, weight, chance in zip(
