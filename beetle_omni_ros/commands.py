@@ -269,7 +269,8 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
           resume: Annotated[Path | None, Option(metavar='DIR', help=(
               'Continue from the last checkpoint of a run, or from a model_N.pt.'))] = None,
           teacher: Annotated[Path | None, Option(metavar='FILE', help=(
-              'Imitate the policy of a model_N.pt at first, with a network of any size.'))] = None,
+              'Begin as the policy of a model_N.pt or of an ONNX file does, with a network of any '
+              'size.'))] = None,
           smoke: Annotated[bool, Option('--smoke', help=(
               'Test all parts with tiny sizes.'))] = False,
           stop_after: Annotated[float | None, Option(min=0, metavar='SECONDS', help=(

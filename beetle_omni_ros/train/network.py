@@ -15,6 +15,7 @@ import warnings
 
 import numpy as np
 import onnx
+from onnx import numpy_helper
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP
 import torch
@@ -127,20 +128,37 @@ class FeatureModel(MLPModel):
         return self.features(torch.zeros(1, self.obs_dim)).shape[-1]
 
 
-def actor_of(checkpoint: Path, like: FeatureModel) -> FeatureModel:
-    """Actor of a checkpoint, whose network may have other layers; ParameterError if none."""
+def actor_of(path: Path, like: FeatureModel) -> FeatureModel:
+    """Actor of a checkpoint or policy file, with layers of any size; ParameterError if none."""
     try:
-        saved = torch.load(str(checkpoint), map_location='cpu', weights_only=True)
-        layers = {name.removeprefix('mlp.'): value for name, value
-                  in saved['actor_state_dict'].items() if name.startswith('mlp.')}
+        layers = _layers(path, like.output_scale)
         *hidden, out = [len(value) for name, value in layers.items() if name.endswith('bias')]
         actor = copy.deepcopy(like)
         actor.mlp = MLP(like.mlp[0].in_features, out, hidden)
         actor.mlp.load_state_dict(layers)
     except Exception as error:      # torch's errors for a bad file have no common base class
-        raise ParameterError(f'{checkpoint}: no checkpoint of a policy with the same inputs '
+        raise ParameterError(f'{path}: no checkpoint or policy with the same inputs '
                              f'({" ".join(str(error).split())[:160]})') from None
     return actor.to(like.mlp[0].weight.device).requires_grad_(False)
+
+
+def _layers(path, scale):
+    """Weights and biases of the network in a file, first to last, by the names of the network."""
+    if path.suffix != '.onnx':
+        saved = torch.load(str(path), map_location='cpu', weights_only=True)['actor_state_dict']
+        return {name.removeprefix('mlp.'): value for name, value in saved.items()
+                if name.startswith('mlp.')}
+    graph = onnx.load(path).graph
+    arrays = {each.name: torch.tensor(numpy_helper.to_array(each)) for each in graph.initializer}
+    # The normalised errors complete the features, see ExportedPolicy; linear layers follow.
+    behind = [node.op_type for node in graph.node].index('Div')
+    pairs = [[arrays[name] for name in node.input[1:]] for node in graph.node[behind:]
+             if node.op_type == 'Gemm']
+    (*_, (_, before)), (weight, bias) = pairs[:-1], pairs[-1]
+    # the last weights stand beside the carried actions, with the scale of the output
+    pairs[-1] = weight[:, :len(before)] / scale, bias / scale
+    return {f'{2 * k}.{kind}': value for k, pair in enumerate(pairs)
+            for kind, value in zip(('weight', 'bias'), pair, strict=True)}
 
 
 class ExportedPolicy(torch.nn.Module):

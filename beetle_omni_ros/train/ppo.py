@@ -28,7 +28,7 @@ class GraphPpo(PPO):
     rsl-rl's PPO; :meth:`collect` and :meth:`learn_batch` run as captured graphs on a GPU.
 
     With a ``teacher``, a student of any size also minimises the divergence from its actions
-    ("kickstarting", Schmitt et al. 2018).
+    ("kickstarting", Schmitt et al. 2018). One of the same size begins with its weights.
 
     Attributes:
         scheduled: (5,) on the device: desired KL, weights of the entropy and of the divergence
@@ -61,6 +61,8 @@ class GraphPpo(PPO):
             lr=self.rate if graphs else p.learning_rate, eps=ADAM_EPSILON,
             capturable=graphs, fused=graphs or None)
         self.teacher = teacher and actor_of(teacher, self.actor)
+        if self.teacher and str(self.teacher.mlp) == str(self.actor.mlp):
+            self.actor.mlp.load_state_dict(self.teacher.mlp.state_dict())
         self.scheduled = torch.zeros(5, device=self.device)
         self._loss, self._mean = (torch.compile(function, dynamic=False) if graphs else function
                                   for function in (self._losses, self.actor.mean))

@@ -194,6 +194,8 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     if output is None and resume is None:
         raise ParameterError('--output: missing; expected a folder for the training')
     where = choose_device(device)
+    if where.startswith('cuda'):
+        torch.cuda.set_device(where)    # Triton launches its kernels on the present device
     checkpoint = None
     if resume:
         last = max(_checkpoints(resume), default=(0, None))[1]

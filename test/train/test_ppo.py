@@ -6,6 +6,7 @@ from rsl_rl.algorithms import PPO
 import torch
 
 from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.train.network import actor_of, export_policy
 from beetle_omni_ros.train.runner import Runner
 
 
@@ -116,7 +117,26 @@ def test_a_smaller_student_approaches_its_teacher(tmp_path):
     assert apart() < 0.5 * before
 
 
+def test_a_policy_file_teaches_what_its_checkpoint_does(tmp_path):
+    teacher = randomised(Runner(small({'network.hidden': [24, 20]}), ROBOT, tmp_path), seed=3)
+    actor, policy = teacher.alg.actor, tmp_path / 'policy.onnx'
+    with torch.no_grad():       # the exporter leaves out what is zero
+        actor.mlp[-1].bias.fill_(0.1)
+    export_policy(actor, policy, ROBOT, teacher.parameters, {})
+    seen = torch.randn(50, 33, generator=torch.Generator().manual_seed(1))
+    for path in (teacher.checkpoint(), policy):
+        read = actor_of(path, Runner(small(), ROBOT).alg.actor)
+        torch.testing.assert_close(read.mean(seen), actor.mean(seen), rtol=1e-5, atol=1e-5)
+
+
+def test_a_student_of_the_same_size_begins_with_its_teacher(tmp_path):
+    teacher = randomised(Runner(small(), ROBOT, tmp_path), seed=3)
+    student = Runner(small({'seed': 5}), ROBOT, teacher=teacher.checkpoint()).alg.actor
+    seen = torch.randn(50, 33, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(student.mean(seen), teacher.alg.actor.mean(seen))
+
+
 def test_a_teacher_with_other_inputs_is_refused(tmp_path):
     teacher = Runner(small({'memory': True}), ROBOT, tmp_path).checkpoint()
-    with pytest.raises(ParameterError, match='no checkpoint of a policy with the same inputs'):
+    with pytest.raises(ParameterError, match='no checkpoint or policy with the same inputs'):
         Runner(small(), ROBOT, teacher=teacher)

@@ -30,6 +30,7 @@ MODULES = 'module_reaction'
 NO_SIZE = Size(0.5, 0.0)     # of a parameter that only selects a form
 # Effects without a slope at their neutral value; they need a start where they act.
 LIMITS = tuple(name for name, treatment in TREATMENTS.items() if treatment.starts)
+SWING = 'swing.ratio'        # logarithm of the apparent inertia of the servos
 TILT_BUS, THRUST_BUS = 'base.tilt_delay', 'base.thrust_delay'   # delays of commands
 # Typical and smallest deviations of the catalogue are those of a robot of this size.
 WEIGHT, ARM = 29.8, 0.2754      # [N], [m] params/robot.yaml
@@ -193,7 +194,7 @@ def extra_keys() -> dict[str, Key]:
     for k in range(12):
         add(f'position.offset[{k}]', k, 0.001, 'B', body=True)
     add('modules.share', None, 0.05, 'BJ', step=0.05)
-    add('swing.ratio', None, 0.1, 'J', step=0.01)
+    add(SWING, None, 0.3, 'J', step=0.01)
     for k in range(4):
         add(f'rotor.lag[{k}]', k, 0.1, 'B', step=0.02)
         for gain in ('kp', 'kd'):

@@ -93,7 +93,8 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
     alpha = engine.alpha
     tests: list[tuple] = [(engine, solution, keys), *([(slow, slow, slow.keys)] if slow else [])]
     e_value = float(np.logaddexp.reduce([s.e_value for _, s, _ in tests])) - log(len(tests))
-    chance = exp(min(0.0, -e_value))
+    # where feedback hides the robot, no alpha names anything
+    chance = 1.0 if len(solution.banned) > MOST_FED_BACK else exp(min(0.0, -e_value))
     found = [(e, s, own, k, members) for e, s, own in tests if chance <= alpha
              for k, members in named_of(e, s, alpha)]
     effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]

@@ -126,11 +126,11 @@ TREATMENTS: dict[str, Treatment] = {
         ('voltage_sag', 'thrust_coefficient'), 'climb at full thrust',
         starts=((0.95,), (0.8,)), limit=('thrust', 1.2)),
     'command_latency': Treatment(
-        {'delay': Size(0.02, 0.003)}, 'fast tilting and thrust steps',
+        {'delay': Size(0.02, 0.003, 'delay')}, 'fast tilting and thrust steps',
         ('joint_command_latency', 'rotor_dead_time', 'joint_bandwidth'),
         'sine sweep of the tilts 0.5 to 6 Hz with thrust steps', 'BJ'),
     'joint_command_latency': Treatment(
-        {'delay': Size(0.02, 0.003)}, 'fast tilting',
+        {'delay': Size(0.02, 0.003, 'delay')}, 'fast tilting',
         ('joint_bandwidth', 'command_latency', 'joint_feedback_delay'),
         'sine sweep of the tilts 0.5 to 6 Hz', 'J'),
     'joint_bandwidth': Treatment(

@@ -20,8 +20,10 @@ from beetle_omni_ros.identify.flights.keys import (
     extra_keys,
     keys_of,
     LIMITS,
+    MODULES,
     Prior,
     prior_of,
+    SWING,
     THRUST_BUS,
     TILT_BUS,
     tolerances,
@@ -77,6 +79,9 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     priors, entries, bounds, far = _priors(robot, {
         n: key for n, key in keys.items() if key.effect in CATALOGUE and not key.form
         and key.effect not in {*LIMITS, *p.without}}, tolerance)
+    if robot.multibody is None:     # modules that the file does not have also load the servos
+        entries = [replace(entry, keys=(*entry.keys, SWING)) if entry.name == MODULES else entry
+                   for entry in entries]
     priors |= {n: Prior(tolerance[n], key.typical, 0.0) for n, key in keys.items()
                if n in tolerance and n not in priors and key.effect not in p.without
                and (n != 'modules.share' or robot.multibody is not None)}
@@ -153,9 +158,9 @@ def _delays(robot, p, coarse):
     bus, imu = (-p.command_delay, p.bus_late), p.coarse_imu if coarse else p.imu_averaging
     swing = swing_of(robot)
     deviations = {TILT_BUS: p.bus_near, THRUST_BUS: p.bus_near, IMU_LAG: imu,
-                  'swing.ratio': p.tolerance_swing + swing}
+                  SWING: p.tolerance_swing + swing}
     limits = {TILT_BUS: bus, THRUST_BUS: bus, IMU_LAG: (0.0, imu),
-              'swing.ratio': (-p.tolerance_swing, swing + p.tolerance_swing)}
+              SWING: (-p.tolerance_swing, swing + p.tolerance_swing)}
     if coarse:
         deviations['joint_feedback_delay.delay'] = p.coarse_encoders
         limits['joint_feedback_delay.delay'] = 0.0, p.coarse_encoders
