@@ -235,7 +235,8 @@ def _of(message, field, names):
             [message.name.index(name) for name in names]
         return np.array([values[k] for k in order], dtype=float).T
     except ValueError:
-        raise MessageError(f"names are not {', '.join(names)}") from None
+        raise MessageError(f"names are {', '.join(map(str, message.name[:8]))}, "
+                           f"not {', '.join(names)}") from None
     except IndexError:
         raise MessageError(f'{field} has too few values for the names') from None
 

@@ -55,17 +55,17 @@ def thrust_direction(arm_yaw: float, tilt):
 def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, tilt, thrust,
                force_world=ZERO_3, torque_body=ZERO_3, tilt_acceleration=ZERO_4, effects=None, *,
                tilt_rate=ZERO_4, thrust_rate=ZERO_4, position=None, voltage_ratio=None,
-               charge_drawn=None, rotor_positions=None):
+               states=None, rotor_positions=None):
     """
     Newton-Euler equations of the robot as one rigid body.
 
     Forces are summed at base_link, and the body turns about its centre of mass. The acceleration
     is that of the origin of base_link. The two points differ only if an effect moves the centre
     of mass. Arguments are named as the fields of :class:`Terms`, ``quaternion`` is body to world.
-    Without position, voltage_ratio or charge_drawn their effects are absent. ``effects`` (name ->
-    parameter -> value or symbol) and ``rotor_positions`` (4, 3) [m] replace those of the robot
-    file. Returned are the acceleration (3,) in world [m/s^2] and the angular acceleration (3,) in
-    body [rad/s^2].
+    Without position, voltage_ratio or ``states`` (name -> (4,)) their effects are absent.
+    ``effects`` (name -> parameter -> value or symbol) and ``rotor_positions`` (4, 3) [m] replace
+    those of the robot file. Returned are the acceleration (3,) in world [m/s^2] and the angular
+    acceleration (3,) in body [rad/s^2].
     """
     rotors = robot.rotors
     places = rotors.positions if rotor_positions is None else rotor_positions
@@ -80,12 +80,13 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
                          for i in range(4)],
         hover_thrust=robot.hover_thrust, force_world=force_world, rotor_forces=[0] * 4,
         torque_ratio=rotors.torque_to_thrust_ratio, tilt_rate=tilt_rate, thrust_rate=thrust_rate,
-        spin=tuple(map(float, rotors.spin)), position=position, voltage_ratio=voltage_ratio,
-        charge_drawn=charge_drawn)
+        spin=tuple(map(float, rotors.spin)), position=position, voltage_ratio=voltage_ratio)
     effects = robot.effects if effects is None else effects
     for name, effect in CATALOGUE.items():
+        terms.state = (states or {}).get(name)
+        needed = (*effect.measured, 'state') if effect.rate else effect.measured
         if name in effects and effect.apply is not None and not any(
-                getattr(terms, term) is None for term in effect.measured):
+                getattr(terms, term) is None for term in needed):
             effect.apply(terms, **effects[name])
     force, torque = 0, terms.torque
     for i in range(4):
@@ -114,12 +115,15 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
 
     Returns:
         f(quaternion, velocity, rate, tilt, tilt_rate, tilt_acceleration, thrust, thrust_rate,
-        position, voltage_ratio, charge_drawn) -> force and torque (6,).
+        position, voltage_ratio, states of each named effect with a rate (4,)) -> force and torque
+        (6,).
 
     """
     sizes = {'quaternion': 4, 'velocity': 3, 'rate': 3, 'tilt': 4, 'tilt_rate': 4,
              'tilt_acceleration': 4, 'thrust': 4, 'thrust_rate': 4, 'position': 3,
-             'voltage_ratio': 1, 'charge_drawn': 1}
+             'voltage_ratio': 1}
+    slow = [name for name in names if CATALOGUE[name].rate]
+    sizes |= {f'state_of_{name}': 4 for name in slow}
     x = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     both = {name: robot.effects[name] for name in ('torque_coefficient',) if name in robot.effects}
 
@@ -127,8 +131,8 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
         acceleration, turning = rigid_body(
             robot, x['velocity'], x['quaternion'], x['rate'], x['tilt'], x['thrust'],
             tilt_acceleration=x['tilt_acceleration'], effects=effects,
-            **{name: x[name] for name in ('tilt_rate', 'thrust_rate', 'position',
-                                          'voltage_ratio', 'charge_drawn')})
+            states={name: x[f'state_of_{name}'] for name in slow}, **{name: x[name] for name in (
+                'tilt_rate', 'thrust_rate', 'position', 'voltage_ratio')})
         return robot.mass * acceleration, ca.DM(robot.inertia) * turning
 
     without = wrench(both)

@@ -18,8 +18,8 @@ LEAST_HEIGHT = 0.08         # [m] below which the law is not valid
 NO_JOINTS = 'the filter does not read the joints'
 # Terms that the simulated plant and the gap finder have -> why NMPC and training leave out an
 # effect of them.
-MEASURED = {'voltage_ratio': 'it has no voltage and assumes a full pack',
-            'charge_drawn': 'it has no current of the pack and assumes that no charge was drawn'}
+MEASURED = {'voltage_ratio': 'it has no voltage and assumes a full pack'}
+NO_STATE = 'it does not integrate the state of an effect'
 CONSUMERS = {'nmpc': 'NMPC and allocation', 'training': 'training', 'plant': 'simulated plant',
              'estimator': 'estimator', 'buses': 'delays of the buses', 'gap': 'gap finder'}
 _CORRECTED = 'the estimator corrects the readings first'
@@ -385,6 +385,8 @@ def ignored(consumer: str, name: str) -> str:
     ``test/gap/test_consumers.py`` checks every pair against the consumer's results.
     """
     effect = CATALOGUE[name]
-    if effect.measured and consumer in ('nmpc', 'training'):
-        return '; '.join(MEASURED[term] for term in effect.measured)
+    if consumer in ('nmpc', 'training'):
+        lacking = [MEASURED[term] for term in effect.measured] + [NO_STATE] * bool(effect.rate)
+        if lacking:
+            return '; '.join(lacking)
     return effect.ignored_by.get(consumer) or _IGNORED.get(consumer, {}).get(effect.kind, '')

@@ -41,9 +41,7 @@ class Terms:
     spin: tuple[float, ...]         # (4,) +1 along the thrust
     position: ca.SX | None = None       # (3,) of base_link in world [m]; None: unknown
     voltage_ratio: ca.SX | None = None  # of the pack over that of a full pack; None: unknown
-    # Drawn from the pack [A h], None: unknown. In the simulator since the pack was inserted, in a
-    # recording since its first battery message.
-    charge_drawn: ca.SX | None = None
+    state: ca.SX | None = None      # (4,) of the effect's rate, at the rotors; None: unknown
 
     def rotor_speeds(self) -> list:
         """Rotor speeds relative to hover, computed from thrust; list of four scalars."""
@@ -133,6 +131,9 @@ class Effect:
     apply: Callable | None = None
     # Equation of a joint effect, which changes ServoTerms: servo(terms, joint, **values).
     servo: Callable | None = None
+    # Rate [1/s] of a state of each rotor that is zero at the begin of a flight, such as a
+    # temperature: rate(state (4,), thrust over hover thrust (4,), **values), of NumPy arrays.
+    rate: Callable | None = None
     each: str = ''      # 'rotor' or 'joint' if parameters are (4,), 'term': one each expression
     # Delayed quantities: 'tilt' and 'thrust' commands, readings of 'imu', 'mocap', 'encoders'.
     delays: tuple[str, ...] = ()
@@ -150,6 +151,19 @@ class Effect:
     def in_readings(self, parameter: str) -> bool:
         """Whether a parameter affects sensor readings only, not the model's equations."""
         return bool(self.parameters[parameter].sensor) or self.kind == 'play'
+
+    def advanced(self, values: dict, state: np.ndarray, thrust: np.ndarray, step: float
+                 ) -> np.ndarray:
+        """
+        States (4,) of the rotors a ``step`` [s] later, by Euler's method.
+
+        ``values`` are the parameters, of which those within their bounds are used, ``thrust`` (4,)
+        is that over hover thrust.
+        """
+        assert self.rate is not None
+        return state + step * self.rate(state, thrust, **{
+            key: np.clip(value, self.parameters[key].low, self.parameters[key].high)
+            for key, value in values.items()})
 
     @property
     def kind(self) -> str:

@@ -177,14 +177,26 @@ class AddedForces:
         self._laws = [(LAWS[name], robot.effects[name]) for name in names] if own else []
         self._model = None if own else native.buffered(native.compiled(
             dynamics.added_wrench(robot, names)))
+        self._slow = [name for name in names if CATALOGUE[name].rate]
+        self.restart()
         self.active = bool(names) or has_play
         self._sideways = np.cross(robot.tilt_axes, [0.0, 0.0, 1.0])
         # torque (3,) of forces (4, 3) at the rotors, as one product
         self._torques = np.hstack([rotations.skew(r) for r in robot.rotors.positions])
         self._reaction = robot.rotors.spin * robot.torque_ratio
 
+    def restart(self) -> None:
+        """Set the states of effects to zero."""
+        self._states = {name: np.zeros(4) for name in self._slow}
+
+    def advance(self, thrust: np.ndarray, step: float) -> None:
+        """Integrate the states of effects over a ``step`` [s] with thrusts (4,) [N]."""
+        for name, state in self._states.items():
+            self._states[name] = CATALOGUE[name].advanced(
+                self._robot.effects[name], state, thrust / self._robot.hover_thrust, step)
+
     def __call__(self, quaternion: np.ndarray, driven: np.ndarray, tilt_acceleration: np.ndarray,
-                 charge_drawn: float, **motion: Any) -> np.ndarray:
+                 **motion: Any) -> np.ndarray:
         """
         Force in world [N] and torque in base_link [N m] at base_link, (6,).
 
@@ -211,7 +223,8 @@ class AddedForces:
         if self._model:
             wrench += self._model(
                 quaternion, at.velocity, at.rate, at.tilt, at.tilt_rate, tilt_acceleration, thrust,
-                at.thrust_rate, at.position, at.voltage_ratio, charge_drawn)
+                at.thrust_rate, at.position, at.voltage_ratio,
+                *self._states.values())
         return wrench
 
 

@@ -56,7 +56,7 @@ class Plant:
 
     Attributes:
         wrench: (6,) external force in world [N] and torque in base_link [N m] at base_link.
-        voltage_ratio, charge_drawn: of the battery, relative to a full one, and [A h].
+        voltage_ratio: of the battery, relative to a full one.
         state: position, quaternion wxyz, tilts (11,) and velocities (10,).
         tilt, encoder: (4,) true tilts of the rotors, and angles at the encoders, on the side of
             the motor or of the rotor [rad].
@@ -92,7 +92,7 @@ class Plant:
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
         self._commanded_thrust, self._act = self.data.ctrl[:4], self.data.act
         self._acceleration, self._applied = self.data.qacc, self.data.qfrc_applied[:6]
-        self.voltage_ratio, self.charge_drawn = 1.0, 0.0
+        self.voltage_ratio = 1.0
         self.wrench = np.zeros(6)
         self._payload: float | None = None      # not yet set
         self._servos = ALL, NONE
@@ -124,6 +124,7 @@ class Plant:
         self._qvel[:], self._tilt[:], self.data.act[:] = velocity, tilt, thrust
         self.set_targets(tilt, thrust)
         self._shaft, self._friction = np.array(tilt), np.zeros(4)
+        self._added.restart()
         self._update()
 
     def set_targets(self, tilt: np.ndarray, thrust: np.ndarray, powered: Sequence[bool] = ALL,
@@ -181,6 +182,7 @@ class Plant:
                 if self._has_friction:
                     self._rub(others)
                 mujoco.mj_step(model, data)
+        self._added.advance(self._scale * data.act, self._tick)
         if self._has_play:
             self._shaft = clipped(self._shaft, self._tilt - self._half_gap,
                                   self._tilt + self._half_gap)
@@ -237,7 +239,7 @@ class Plant:
         tilt = clipped(self._shaft, driven - self._half_gap, driven + self._half_gap) \
             if self._has_play else driven
         applied += self._added(
-            quaternion, driven, self._acceleration[6:], self.charge_drawn,
+            quaternion, driven, self._acceleration[6:],
             position=self._qpos[:3], velocity=motion[:3], rate=motion[3:6], tilt=tilt,
             tilt_rate=motion[6:], thrust=thrust, thrust_rate=(commanded - thrust) / lag,
             voltage_ratio=self.voltage_ratio)

@@ -44,7 +44,7 @@ class Battery:
         """Set the initial charge and no load."""
         self.charge = self._parameters.battery_charge   # [-] of a full battery
         self.extra_resistance = 0.0         # [ohm] of a bad contact or cell
-        self.current = self.drawn = 0.0     # [A] positive; [A h] since the reset
+        self.current = 0.0      # [A] positive
         self.voltage = self.rest_voltage    # [V] under the present load
 
     @property
@@ -64,7 +64,6 @@ class Battery:
         self.current = power / self.voltage
         if resistance:
             self.current = min(self.current, (rest - self.voltage) / resistance)
-        self.drawn += self.current * duration / 3600
         self.charge = max(0.0, self.charge - self.current * duration
                           / (3600 * parameters.battery_capacity))
 
@@ -234,7 +233,6 @@ class Simulator:
         plant.wrench[:] = sum(schedule.each('wrench'), self.wrench)
         plant.set_payload(sum(schedule.each('payload'), self.payload))
         plant.voltage_ratio = battery.voltage / self._robot.battery.full_voltage
-        plant.charge_drawn = battery.drawn
         plant.step()
         if struck or self._wear is not INTACT:
             # Wear shows with the thrust, which follows with the rotors' lag.

@@ -100,7 +100,7 @@ def test_odometry_carries_the_twist_in_base_link():
 
 
 @pytest.mark.parametrize(('topic', 'written', 'bad', 'reason'), [
-    ('rotor_states', 'joint_states', JointReading(1.0, np.zeros(1), None), 'names are not'),
+    ('rotor_states', 'joint_states', JointReading(1.0, np.zeros(1), None), 'not rotor1'),
     ('joint_states', 'joint_states', JointReading(1.0, np.zeros(1), None), 'too few'),
     ('target_pose', 'target_pose', PoseTarget(np.zeros(3), [0, 0, 0, 0.9]), 'unit quaternion')])
 def test_a_bad_message_is_refused_with_a_reason(topic, written, bad, reason):

@@ -5,8 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from beetle_omni_ros.identify.flights import discrepancy
+from beetle_omni_ros.identify.flights.discrepancy import of_thrusts
 from beetle_omni_ros.identify.flights.quality import line, repeatable
 from beetle_omni_ros.identify.flights.spectrum import spectrum
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -16,7 +19,7 @@ CHANNELS = 'force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torque_z'
 COUNTS, PERIOD = (3200, 2580), 0.02      # blocks of 8 and of 8.6 s
 
 
-def flight(seed, count, extra=lambda motion, time: 0.0):
+def flight(seed, count, extra=lambda motion, noise: 0.0):
     """A flight of smooth random motion, and its residual: white noise of one, and ``extra``."""
     rng = np.random.default_rng(seed)
 
@@ -25,12 +28,13 @@ def flight(seed, count, extra=lambda motion, time: 0.0):
         return size * x / x.std(axis=0)
 
     motion = {'velocity': smooth(3, 0.3), 'position': smooth(3, 0.5), 'tilt': smooth(4, 0.6),
-              'tilt_rate': smooth(4, 0.5), 'rate': smooth(3, 0.3),
+              'rate': smooth(3, 0.3), 'thrust': ROBOT.hover_thrust + smooth(4, 1.0),
               'quaternion': Rotation.from_rotvec(smooth(3, 0.3)).as_quat()}
     time = PERIOD * np.arange(count)
     made = SimpleNamespace(robot=ROBOT, motion=motion, time=time, period=PERIOD, highest=8.0,
                            mask=np.ones((count, 6), dtype=bool))
-    residual = rng.normal(size=(count, 6)) + extra(motion, time)
+    residual = rng.normal(size=(count, 6))
+    residual += extra(motion, residual)
     found = spectrum(residual, np.zeros((count, 6, 1)), made.mask, PERIOD, np.full(6, 1e-6), 8.0,
                      [np.arange(6)], np.eye(1, 2).repeat(6, axis=0))
     found.noise[:] = np.eye(6)
@@ -53,16 +57,41 @@ def test_noise_alone_is_neither_repeatable_nor_a_line():
 
 
 def test_a_force_that_depends_on_the_tilts_is_repeatable():
-    def downwash(motion, time):
+    def downwash(motion, noise):
         lost = np.sin(motion['tilt'][:, 0])
         return np.outer(lost, [0.0, 0.0, -1.0, 0.5, 0.0, 0.0])
 
     assert both_tests((1, 2), extra=downwash)[0].probability < 0.01
 
 
+def test_a_thrust_that_depends_on_the_own_inflow_of_each_rotor_is_repeatable():
+    def inflow(motion, noise):
+        axes, slopes = of_thrusts(ROBOT, motion['tilt'])
+        turn = Rotation.from_quat(motion['quaternion']).as_matrix()
+        along = np.einsum('nix,nyx,ny->ni', axes, turn.transpose(0, 2, 1), motion['velocity'])
+        return np.einsum('nci,ni->nc', slopes, -0.5 * along)
+
+    assert both_tests((5, 6), extra=inflow)[0].probability < 0.01
+
+
+def test_forces_that_move_the_robot_are_no_law_of_its_velocity(monkeypatch):
+    def gusts(motion, noise):
+        turn = Rotation.from_quat(motion['quaternion']).as_matrix()
+        force = np.einsum('nij,nj->ni', turn, noise[:, :3])
+        # brakes within a second; the measured velocity is smoothed, and knows what comes
+        motion['velocity'] = gaussian_filter1d(lfilter([PERIOD], [1, PERIOD - 1], force, axis=0),
+                                               0.1 / PERIOD, axis=0)
+        return 0.0
+
+    assert both_tests((7, 8), extra=gusts)[0].probability > 0.025
+    monkeypatch.setattr(discrepancy, 'LATE', 0.0)
+    assert both_tests((7, 8), extra=gusts)[0].probability < 0.01
+
+
 def test_a_vibration_is_a_line_of_its_frequency_in_flights_of_any_length():
-    def shaking(motion, time):
-        return np.outer(np.sin(2 * np.pi * 5.3 * time), [0.0, 0.25, 0.0, 0.0, 0.0, 0.0])
+    def shaking(motion, noise):
+        phase = 2 * np.pi * 5.3 * PERIOD * np.arange(len(noise))
+        return np.outer(np.sin(phase), [0.0, 0.25, 0.0, 0.0, 0.0, 0.0])
 
     found = both_tests((3, 4), extra=shaking)[1]
     assert found.probability < 1e-6 and found.channels[0] == 'force_y'

@@ -7,13 +7,13 @@ from flights import KEYS, model, Motion, P, ROBOT, solved, STEP
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.flights.bag_flight import starts_of
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.keys import Entry, Prior
 from beetle_omni_ros.identify.flights.results import effect_of
 from beetle_omni_ros.identify.flights.servo import (
     module_load,
     simulate,
+    starts_of,
     undescribed_load,
     Windows,
 )
@@ -107,6 +107,23 @@ def test_a_servo_effect_is_recovered_from_commands_and_encoders(true, expected, 
     found = solved(model(flight(servo(**true))), list(expected), 'J', None, start, 6)
     for name, value in expected.items():
         assert KEYS[name].value(found[name]) == pytest.approx(value, abs=within)
+
+
+def test_friction_also_acts_on_the_body_where_a_servo_model_gives_the_tilts():
+    made, start = model(flight(servo(coulomb=0.008, stiction=0.008))), 'joint_friction@0'
+    friction = {f'joint_friction.{name}': 0.008 for name in ('coulomb', 'stiction')}
+    made.starts = {start: friction}
+    assert not made.linear({}, [start]).slopes[:, :6].any()     # encoders give the tilts
+    made.signals.reading_noise = 0.1
+    made.settle({})
+    slopes, expected = made.linear({}, [start]).slopes[:, :6, 0], []
+    for theta in ({}, friction):        # twice, because the windows begin at the tilts before
+        made.settle(theta)
+        made.settle(theta)
+        expected.append(made.residual(theta, 'B')['B'])
+    change = (expected[1] - expected[0]).ravel()
+    assert np.abs(change).max() > 0.01
+    assert np.corrcoef(slopes.ravel(), change)[0, 1] > 0.95
 
 
 @pytest.mark.parametrize('fading, start', [(0.03, 0.012), (0.1, 0.004)])

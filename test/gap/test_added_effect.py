@@ -4,32 +4,30 @@ from dataclasses import replace
 from pathlib import Path
 import re
 
-from flights import model, Motion, P, ROBOT, solved
+from flights import model, Motion, ROBOT, solved
 from flown_once import FIVE_POSES
 import numpy as np
 import pytest
 from rich.console import Console
 from test_consumers import OUTPUTS, plain, with_effect
-from test_ingest import recording
 
 import beetle_omni_ros
 from beetle_omni_ros.identify.flights.body import BodyModel
 from beetle_omni_ros.identify.flights.command import gap_results
 from beetle_omni_ros.identify.flights.keys import all_keys, entries_of, extra_keys
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
-from beetle_omni_ros.identify.recording.flight import prepare
 from beetle_omni_ros.model.effects import CATALOGUE, ignored
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs/how-to/add_an_effect.md'
-ENTRY, TREATMENT, MEASURED, TEST = re.findall(r'```python\n(.*?)```', PAGE.read_text(), flags=re.S)
-HEAT, FADE = 'motor_heat', 'charge_fade'    # the second of a measured quantity
+ENTRY, TREATMENT, STATE, TEST = re.findall(r'```python\n(.*?)```', PAGE.read_text(), flags=re.S)
+HEAT, WARMING = 'motor_heat', 'motor_warming'    # the second has a state
 
 
 @pytest.fixture(autouse=True)
 def added(monkeypatch):
     """The catalogue with the page's entries."""
     made = {}
-    for text in (ENTRY, TREATMENT, MEASURED):
+    for text in (ENTRY, TREATMENT, STATE):
         exec(compile(text, str(PAGE), 'exec'), made)
         for name, entry in made['CATALOGUE'].items():
             monkeypatch.setitem(CATALOGUE, name, entry)
@@ -48,17 +46,17 @@ def test_the_test_of_the_page_passes_only_with_the_new_entry(monkeypatch):
 
 
 @pytest.mark.parametrize('consumer', ['nmpc', 'training', 'plant'])
-@pytest.mark.parametrize('name', [HEAT, FADE])
-def test_a_consumer_applies_the_added_effect_or_has_no_such_quantity(name, consumer):
+@pytest.mark.parametrize('name', [HEAT, WARMING])
+def test_a_consumer_applies_the_added_effect_or_has_no_such_state(name, consumer):
     reason = ignored(consumer, name)
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](with_effect(name))])
     assert (not reason) == (name == HEAT or consumer == 'plant')
     assert np.array_equal(found, plain(consumer)) == bool(reason)
-    assert not reason or 'no charge was drawn' in reason
+    assert not reason or 'does not integrate' in reason
 
 
 @pytest.mark.parametrize('name, values, value', [
-    (HEAT, {'loss_per_kelvin': 0.0, 'temperature': 50.0}, 0.004), (FADE, {'loss': 0.0}, 0.1)])
+    (HEAT, {'loss_per_kelvin': 0.0, 'temperature': 50.0}, 0.004), (WARMING, {'loss': 0.0}, 0.1)])
 def test_the_gap_finder_identifies_the_added_effect(name, values, value):
     robot = replace(ROBOT, effects={name: values})
     keys, key = {**all_keys(robot), **extra_keys()}, f'{name}.{next(iter(values))}'
@@ -67,7 +65,8 @@ def test_the_gap_finder_identifies_the_added_effect(name, values, value):
     assert np.abs(weak['B'] - made.residual({}, 'B')['B']).max() > 0.01
     assert solved(made, [key], 'B', base=weak)[key] == pytest.approx(value, rel=1e-6)
     entry, = entries_of({n: own for n, own in keys.items() if own.effect == name and not own.form})
-    assert entry.keys == (key,)
+    assert entry.keys[0] == key and set(entry.keys) == {
+        f'{name}.{parameter}' for parameter in CATALOGUE[name].numbers}
 
 
 def test_a_flight_with_the_added_effect_names_it_with_its_size(tmp_path):
@@ -83,14 +82,17 @@ def test_a_flight_with_the_added_effect_names_it_with_its_size(tmp_path):
     assert low < 0.004 < high < 0.005
 
 
-@pytest.mark.parametrize('current', ['negative', 'positive', 'partly unknown'])
-def test_the_charge_is_the_integral_of_the_current_since_the_first_message(current):
-    made, motion = recording(), Motion()
-    values = made.values['battery_state']
-    values[:, 1] *= -1 if current == 'positive' else 1
-    if current == 'partly unknown':
-        values[10:20, 1] = np.nan
-    flight = prepare(made, ROBOT, P)
-    assert not flight.findings
-    expected = np.interp(flight.start + flight.times['battery_state'], motion.t, motion.charge)
-    np.testing.assert_allclose(flight.values['battery_state'][:, 1], expected, atol=1e-6)
+def test_a_wrong_time_constant_of_a_state_is_named_with_the_true_one(tmp_path):
+    def file(name, time_constant):
+        path = tmp_path / f'{name}.yaml'
+        path.write_text(f'extends: robot.yaml\neffects: {{{WARMING}: {{loss: 0.08, '
+                        f'time_constant: {time_constant}}}}}\n')
+        return path
+    beetle_omni_ros.simulate('nmpc', 'random6', seed=4, bag=tmp_path / 'flight',
+                             plant=file('plant', 10.0))
+    for name, time_constant in (('right', 10.0), ('wrong', 60.0)):
+        result = gap_results([tmp_path / 'flight'], robot=file(name, time_constant),
+                             console=Console(quiet=True))
+        assert [effect['names'] for effect in result['effects']] == [[WARMING]] * (name == 'wrong')
+    low, high = result['effects'][0]['parameters']['time_constant']['interval']
+    assert low < 10.0 < high < 25.0

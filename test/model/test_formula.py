@@ -45,7 +45,7 @@ def states(count=20):
         quaternion = rng.normal(size=4)
         yield (quaternion / np.linalg.norm(quaternion), rng.normal(size=3), rng.normal(size=3),
                rng.uniform(-2, 2, 4), rng.normal(size=4), rng.normal(size=4),
-               rng.uniform(3, 12, 4), rng.normal(size=4), rng.normal(size=3) + [0, 0, 2], 1.0, 0.0)
+               rng.uniform(3, 12, 4), rng.normal(size=4), rng.normal(size=3) + [0, 0, 2], 1.0)
 
 
 @pytest.mark.parametrize('name', SAME)
@@ -62,7 +62,7 @@ def test_the_plant_has_the_formula_of_the_model():
     robot = with_formula(SAME['rotor_drag'][1])
     added, model = AddedForces(robot, False), dynamics.added_wrench(robot, ['formula'])
     names = ('quaternion', 'velocity', 'rate', 'tilt', 'tilt_rate', 'tilt_acceleration', 'thrust',
-             'thrust_rate', 'position', 'voltage_ratio', 'charge_drawn')
+             'thrust_rate', 'position', 'voltage_ratio')
     for state in states(5):
         motion = dict(zip(names, state, strict=True))
         expected = np.ravel(model(*state))

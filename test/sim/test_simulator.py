@@ -81,9 +81,8 @@ def test_rest_voltage_falls_with_the_charge_drawn():
         voltages.append(battery.rest_voltage)
     assert np.all(np.diff(voltages) < 0)
     assert battery.charge == pytest.approx(1 - drawn / WORLD.battery_capacity)
-    assert battery.drawn == pytest.approx(drawn)
     battery.reset()
-    assert battery.drawn == 0
+    assert battery.charge == WORLD.battery_charge
 
 
 def test_the_thrust_limit_equals_that_of_the_map_and_falls_below_it():

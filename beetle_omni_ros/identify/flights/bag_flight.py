@@ -25,12 +25,10 @@ from beetle_omni_ros.identify.flights.servo import (
 )
 from beetle_omni_ros.identify.flights.signals import Signals
 from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear
-from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.recording.bag import COMMAND, Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.identify.recording.series import low_pass, matrices, THIN, within
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.servo import NUMPY, Servo
 
 CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torque_z'),
             'A': ('acceleration_x', 'acceleration_y', 'acceleration_z'),
@@ -56,8 +54,7 @@ class BagFlight:
     Signals, body equations and servos of one flight; all flights share the body equations.
 
     Attributes:
-        modules: share of the file's tilting modules in the model, 0 or 1; fits vary it around
-            that.
+        modules: share of the file's tilting modules in the model, 0 or 1; fits vary it.
         trusted: (N,) whether a grid point is away from the ground and from the rotor limits.
         period: of the samples [s].
         mask: (M, 16) samples that count.
@@ -124,8 +121,9 @@ class BagFlight:
         inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': s.imu(theta)[1],
                   'tilt': tilt, 'tilt_rate': tilt_rate, 'tilt_acceleration': tilt_acceleration,
                   'thrust': thrust, 'thrust_rate': thrust_rate, 'position': position,
-                  'voltage': s.voltage, 'charge': s.charge,
-                  'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0))}
+                  'voltage': s.voltage,
+                  'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0)),
+                  **{f'state of {name}': s.state(name, theta) for name in self._body.slow}}
         return {name: values[self.rows] for name, values in inputs.items()}
 
     def residual(self, theta: dict[str, float], groups: str = 'BAWJ') -> dict[str, np.ndarray]:
@@ -185,8 +183,9 @@ class BagFlight:
         for k, name in enumerate(names):
             if name in self.starts:
                 groups = self._groups_of(name)
-                behind, ahead = (now if end == theta else self.residual(end, groups)
-                                 for end in ends[name])
+                behind, ahead = (
+                    now if end == theta and self.signals.model_tilts is None
+                    else self._guided(end, groups) for end in ends[name])
                 for group in groups:
                     slopes[:, PLACE[group], k] = (ahead[group] - behind[group]) \
                         / own.get(name, 1.0)
@@ -195,6 +194,19 @@ class BagFlight:
                 slopes[:, :, k] = part * of_keys[:, :, keys.index(key)]
         self._runs = {}
         return Linear(residual, slopes, self._measured(theta))
+
+    def _guided(self, theta, groups):
+        """Residual with the tilts of the servo model at ``theta``, where they are of a model."""
+        s = self.signals
+        before, run = s.model_tilts, self._runs.get(frozenset(theta.items()))
+        if before is None or run is None:
+            return self.residual(theta, groups)
+        tilts = before.copy()
+        tilts[self._starts[0]:self._starts[0] + run.size // 4] = run.reshape(-1, 4)
+        s.use_model_tilts(tilts)
+        result = self.residual(theta, groups)
+        s.use_model_tilts(before)
+        return result
 
     def _measured(self, theta):
         """(M, 16) measurements of the channels."""
@@ -208,18 +220,21 @@ class BagFlight:
             self.signals.joints(theta)[3][first:first + count])], axis=1)
 
     def _groups_of(self, start):
-        return self.keys[next(iter(self.starts[start]))].groups
+        """Groups that a start acts on; with tilts of a servo model, servos act on the body."""
+        groups = self.keys[next(iter(self.starts[start]))].groups
+        return groups if self.signals.model_tilts is None else groups.replace('J', 'BJ')
 
     def _slopes(self, theta, now, names):
         """(M, 16, K) derivatives by keys at ``theta``, where the residual is ``now``."""
         slopes = np.zeros((len(names), len(self.channels), len(self.rows))).T
-        body = [k for k, name in enumerate(names) if self.keys[name].body]
+        body = [k for k, name in enumerate(names) if self.keys[name].body
+                and self.keys[name].effect not in self._body.slow]
         if body:
             slopes[:, PLACE['B'], body] = -self._body.derivatives(
                 self._inputs(theta), theta, tuple(names[k] for k in body))
         for k, name in enumerate(names):
             key = self.keys[name]
-            groups = '' if key.body else key.groups.replace('J', '')
+            groups = '' if k in body else key.groups.replace('J', '')
             if name in POSE_SHIFTS:
                 groups = groups.replace('A', '').replace('W', '')
                 slopes[:, 6:12, k] = POSE_SHIFTS[name] * self._of_pose_shift(theta)
@@ -367,33 +382,3 @@ class BagFlight:
         force, load, *more = (series[index].transpose(1, 0, 2) for series in loads)
         return Windows(tilt[at], rate[at], force, load, p.servo_step, skip,
                        round(p.grid / p.servo_step), tuple(more)), edges
-
-
-def starts_of(key, models):
-    """Starts of an effect without a slope; of a limit, where it begins to act in these flights."""
-    treatment = TREATMENTS[key.effect]
-    if treatment.limit is None:
-        return treatment.starts
-    what, below = treatment.limit
-    most = max(float({
-        'tilt_rate': lambda m: np.abs(m.signals.joints({})[1]).max(),
-        'torque': lambda m: np.quantile(np.abs(_torques(m)), 0.999),
-        'thrust': lambda m: np.quantile(m.flight.values[COMMAND][:, 4:], 0.999)}[what](m))
-        for m in models)
-    return tuple((float(np.log(part * most / key.base)),) for part, in treatment.starts
-                 if part * most < below * key.base)
-
-
-def _torques(model):
-    """
-    Torques [N m] that the simulated servo loops request, without limits and encoder noise.
-
-    They include damping, which takes most of the stiffness term while a servo turns.
-    """
-    s, joint = model.signals, model.robot.joints
-    run = model._servos([{}], {})[0]
-    rate = np.gradient(run, model.p.grid, axis=1)
-    times = s.t[model._starts][:, None] + model.p.grid * np.arange(run.shape[1])
-    edges = np.append(times.ravel(), times[-1, -1] + model.p.grid)
-    target = s.tilt_targets(edges, s.delays({})[0]).reshape(run.shape)
-    return Servo.of(joint, effort_limit=None).motor(NUMPY, target - run, rate)

@@ -11,7 +11,7 @@ from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
 
 WIDTHS = {'velocity': 3, 'quaternion': 4, 'rate': 3, 'tilt': 4, 'thrust': 4, 'tilt_rate': 4,
-          'tilt_acceleration': 4, 'thrust_rate': 4, 'position': 3, 'voltage': 1, 'charge': 1,
+          'tilt_acceleration': 4, 'thrust_rate': 4, 'position': 3, 'voltage': 1,
           'modules': 1}
 
 
@@ -26,6 +26,7 @@ class BodyModel:
 
     Attributes:
         names: keys of the parameter vector, in order.
+        slow: effects whose states (N, 4) are inputs.
 
     """
 
@@ -34,7 +35,9 @@ class BodyModel:
         self.names = [name for name, key in keys.items() if key.body]
         self._index = {name: k for k, name in enumerate(self.names)}
         self._p = p = ca.SX.sym('p', len(self.names))
-        self._x = x = {name: ca.SX.sym(name, width) for name, width in WIDTHS.items()}
+        self.slow = [name for name, effect in CATALOGUE.items() if effect.rate]
+        widths = WIDTHS | {f'state of {name}': 4 for name in self.slow}
+        self._x = x = {name: ca.SX.sym(name, width) for name, width in widths.items()}
         effects: dict[str, dict] = {}
         for name, effect in CATALOGUE.items():
             if effect.apply is None or effect.each == 'term' and name not in robot.effects:
@@ -55,7 +58,7 @@ class BodyModel:
             robot, x['velocity'], x['quaternion'], x['rate'], x['tilt'], x['thrust'],
             tilt_acceleration=x['tilt_acceleration'], effects=effects, tilt_rate=x['tilt_rate'],
             thrust_rate=x['thrust_rate'], position=x['position'], voltage_ratio=x['voltage'],
-            charge_drawn=x['charge'], rotor_positions=places)
+            states={name: x[f'state of {name}'] for name in self.slow}, rotor_positions=places)
         rotation = dynamics.rotation_matrix(x['quaternion'])
         force = rotation.T @ (acceleration + ca.DM([0, 0, robot.gravity]))
         self._out = ca.cse(ca.densify(ca.vertcat(force, turning)))
@@ -79,14 +82,14 @@ class BodyModel:
         if (what, count) not in self._maps:
             function = make()
             self._maps[what, count] = function.map(
-                f'{function.name()}_{count}', 'serial', count, [len(WIDTHS)], []).buffer()
+                f'{function.name()}_{count}', 'serial', count, [len(self._x)], []).buffer()
         return self._maps[what, count]
 
     def __call__(self, inputs: dict[str, np.ndarray], theta: dict[str, float]) -> np.ndarray:
         """(N, 6) specific force [m/s^2] and angular acceleration [rad/s^2] of the samples."""
         count = len(inputs['voltage'])
-        return _called(self._over('', count, lambda: self._function), inputs,
-                       self._vector(theta), np.empty((count, 6)))
+        return self._called(self._over('', count, lambda: self._function), inputs,
+                            theta, np.empty((count, 6)))
 
     def derivatives(self, inputs: dict[str, np.ndarray], theta: dict[str, float],
                     names: tuple[str, ...]) -> np.ndarray:
@@ -98,28 +101,26 @@ class BodyModel:
             jacobian = ca.densify(ca.jacobian(self._out, self._p[chosen]))
             return ca.Function('slopes', [*self._x.values(), self._p], [ca.cse(ca.vec(jacobian))])
 
-        flat = _called(self._over(names, count, make), inputs, self._vector(theta),
-                       np.empty((count, len(names), 6)))
+        flat = self._called(self._over(names, count, make), inputs, theta,
+                            np.empty((count, len(names), 6)))
         return flat.transpose(0, 2, 1)
 
-    def _vector(self, theta):
-        return np.array([theta.get(name, 0.0) for name in self.names])
+    def _called(self, function, inputs, theta, result):
+        """
+        Evaluate in place; CasADi's conversion of arrays would take longer than the equations.
 
-
-def _called(function, inputs, vector, result):
-    """
-    Evaluate in place; CasADi's conversion of arrays would take longer than the equations.
-
-    ``function`` is a pair of buffer and evaluation. The memory order of inputs (N, width) equals
-    CasADi's (width, N).
-    """
-    buffer, evaluate = function
-    arrays = [np.ascontiguousarray(inputs[name], dtype=float) for name in WIDTHS]
-    for index, array in enumerate((*arrays, vector)):
-        buffer.set_arg(index, memoryview(array))
-    buffer.set_res(0, memoryview(result))
-    evaluate()
-    return result
+        ``function`` is a pair of buffer and evaluation. The memory order of inputs (N, width)
+        equals CasADi's (width, N).
+        """
+        buffer, evaluate = function
+        vector = np.array([theta.get(name, 0.0) for name in self.names])
+        arrays = [np.ascontiguousarray(one, dtype=float) for one in (
+            *(inputs[name] for name in self._x), vector)]
+        for index, array in enumerate(arrays):
+            buffer.set_arg(index, memoryview(array))        # type: ignore[arg-type]
+        buffer.set_res(0, memoryview(result))
+        evaluate()
+        return result
 
 
 def tilting_modules(robot: RobotParameters) -> tuple[float, float]:

@@ -3,9 +3,8 @@ How well a solution explains flights: discrepancies, errors, and what repeats un
 
 Two tests look at the residual of forces and torques after the fit. They know nothing of causes.
 
-- Repeatable: thrusts and forces as smooth functions of the motion, fitted on all blocks but one,
-  predict the block that is left out. Student's t of the gain over the blocks is the statistic, so
-  that what fits one block alone counts nothing.
+- Repeatable: laws of thrusts, forces and torques that are fitted to one block predict the others.
+  The gain is compared with that of drawn noise. What fits one block alone counts nothing.
 - Line: a frequency at which the whitened spectrum, the mean over the blocks, exceeds its
   neighbours by more than exponentially distributed power allows.
 """
@@ -18,14 +17,15 @@ from math import log
 
 import numpy as np
 from scipy.stats import f as f_law
-from scipy.stats import t as student
 
-from beetle_omni_ros.identify.flights.discrepancy import acting, features_of
+from beetle_omni_ros.identify.flights.discrepancy import laws, placed
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import Solution
+from beetle_omni_ros.identify.flights.linearised import RELEVANT
 from beetle_omni_ros.identify.flights.spectrum import pooled, Spectrum, spectrum
 
-SIZES = (0.001, 0.003, 0.01, 0.03, 0.1)     # amplitudes relative to hover thrust and weight
+DRAWS = 499             # simulated flights without anything unexplained
+OMITTED = RELEVANT**2   # share of thrust and weight: products of deviations, in no linear model
 SLOWEST = 1.0                               # [Hz] of a line; slower ones are the flight's own path
 NEAR = 12                                   # frequencies on each side that a line is compared with
 
@@ -186,24 +186,19 @@ class Unexplained:
 def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
                filters: list[np.ndarray], channels: tuple[str, ...]) -> Unexplained:
     """
-    Test of a discrepancy that predicts blocks which it was not fitted to.
+    Test of laws that predict blocks which they were not fitted to.
 
-    Args:
-        flights: with ``robot``, ``motion`` and ``time``.
-        spectra: of the flights.
-        left: (B, F, C) whitened residual of each flight after the fit.
-        filters: (C, L) whitening filters of each flight.
-        channels: names of all channels.
+    The gain of a group of weights with covariance M is the sum of h_b' M h_c / 2 over pairs of
+    blocks with scores h. The group counts that most exceeds what the power of the noise gives.
 
+    ``flights`` have ``robot``, ``motion`` and ``time``, ``filters`` (C, L) whiten each of them.
+    The others are as of :func:`line`.
     """
-    every = [features_of(flight.motion, flight.time, quick=True) for flight in flights]
-    mean = np.concatenate(every).mean(axis=0)
-    info, score = [], []
-    own = spectra[0].parts[0][0]
-    for flight, found, rest, kernels, x in zip(flights, spectra, left, filters, every,
-                                               strict=True):
-        effect = acting(flight.robot, flight.motion, x - mean, channels)
-        effect = effect.reshape(len(x), len(channels), -1)
+    own, (slopes, groups) = spectra[0].parts[0][0], laws(flights)
+    parts = []
+    for flight, found, rest, kernels, effect in zip(flights, spectra, left, filters, slopes,
+                                                    strict=True):
+        effect = placed(effect, channels)
         small = spectrum(np.zeros(effect.shape[:2]), effect, flight.mask, flight.period,
                          found.floor, flight.highest, [own], kernels)
         count = found.counts[0]
@@ -213,22 +208,31 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
         for band, lost in found.hidden:
             a[:, np.flatnonzero(small.band == band)[:, None], np.isin(own, lost)] = 0.0
         a = (root @ a[:, :count]).reshape(len(rest), -1, effect.shape[2])
-        b = (rest[:, :count][..., own] @ root.T).reshape(len(rest), -1)
-        info.append(a.transpose(0, 2, 1) @ a)
-        score.append((a.transpose(0, 2, 1) @ b[..., None])[..., 0])
-    blocks = list(zip(np.concatenate(info), np.concatenate(score), strict=True))
-    whole, right = (sum(part) for part in zip(*blocks, strict=True))
-    unit = np.eye(len(right))
-
-    def gains_with(size):
-        moved = [np.linalg.solve(whole - g + unit / size**2, right - h) for g, h in blocks]
-        return np.array([h @ w - w @ g @ w / 2 for (g, h), w in zip(blocks, moved, strict=True)])
-
-    gains = max((gains_with(size) for size in SIZES), key=lambda own: own.sum())
-    count, scatter = len(gains), np.std(gains, ddof=1) if len(gains) > 1 else np.inf
-    value = np.mean(gains) / scatter * np.sqrt(count)
-    return Unexplained('repeatable', float(student.sf(value, max(count - 1, 1))),
-                       float(np.sum(gains)), tuple(channels[c] for c in own))
+        b = (rest[:, :count][..., own] @ root.T).reshape(len(rest), -1, 1)
+        parts.append((a, b))
+    info = np.concatenate([a.transpose(0, 2, 1) @ a for a, _ in parts])
+    score = np.concatenate([(a * b).sum(axis=1) for a, b in parts])
+    inner = np.linalg.inv(info.sum(axis=0) + np.eye(len(info[0])) / RELEVANT**2)
+    weights, scatter = inner @ score.sum(axis=0), []
+    for a, b in parts:      # noise has nothing that laws explain of a coefficient by the others
+        b = (b[..., 0] - a @ weights) / (1 - ((a @ inner) * a).sum(axis=2))
+        scatter.append((a * b[..., None]**2).transpose(0, 2, 1) @ a)
+    rng, (values, vectors) = np.random.default_rng(0), np.linalg.eigh(np.concatenate(scatter))
+    roots = vectors * np.sqrt(np.maximum(values, 0))[:, None]
+    drawn = rng.normal(size=(len(score), DRAWS, len(roots[0]))) @ roots.transpose(0, 2, 1)
+    drawn += OMITTED * rng.normal(size=drawn.shape[1:]) @ info
+    drawn = np.concatenate([score[:, None], drawn], axis=1)
+    gains, excess = [], []
+    for c in groups:
+        inner = np.linalg.inv(info[:, c, c].sum(axis=0) + np.eye(c.stop - c.start) / RELEVANT**2)
+        whole, each = (((x @ inner) * x).sum(axis=-1) / 2
+                       for x in (drawn[..., c].sum(axis=0), drawn[..., c]))
+        gains.append(whole - each.sum(axis=0))
+        null = gains[-1][1:]
+        excess.append((gains[-1] - null.mean()) / max(null.std(), 1e-9))
+    most = np.max(excess, axis=0)
+    return Unexplained('repeatable', float(np.mean(most >= most[0])), float(
+        gains[np.argmax([one[0] for one in excess])][0]), tuple(channels[c] for c in own))
 
 
 def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, ...],

@@ -6,12 +6,15 @@ model of the controllers. Each window begins at the measured state. The memory o
 shorter than the warm-up, after which samples count.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.identify.flights.keys import friction, MODULES
+from beetle_omni_ros.identify.flights.keys import friction, Key, MODULES
 from beetle_omni_ros.identify.flights.signals import Signals
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
+from beetle_omni_ros.identify.recording.bag import COMMAND
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.servo import NUMPY, Servo, Step
@@ -186,3 +189,37 @@ def _normal(axis, tilt):
     """(N, 3) thrust direction of a rotor at tilts (N, 1)."""
     level = np.cross(axis, [0.0, 0.0, 1.0])
     return np.cos(tilt) * [0.0, 0.0, 1.0] + np.sin(tilt) * level
+
+
+def starts_of(key: Key, models: Sequence) -> tuple[tuple[float, ...], ...]:
+    """
+    Starts of an effect without a slope; of a limit, where it begins to act in these flights.
+
+    ``models`` are of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`.
+    """
+    treatment = TREATMENTS[key.effect]
+    if treatment.limit is None:
+        return treatment.starts
+    what, below = treatment.limit
+    most = max(float({
+        'tilt_rate': lambda m: np.abs(m.signals.joints({})[1]).max(),
+        'torque': lambda m: np.quantile(np.abs(_torques(m)), 0.999),
+        'thrust': lambda m: np.quantile(m.flight.values[COMMAND][:, 4:], 0.999)}[what](m))
+        for m in models)
+    return tuple((float(np.log(part * most / key.base)),) for part, in treatment.starts
+                 if part * most < below * key.base)
+
+
+def _torques(model):
+    """
+    Torques [N m] that the simulated servo loops request, without limits and encoder noise.
+
+    They include damping, which takes most of the stiffness term while a servo turns.
+    """
+    s, joint = model.signals, model.robot.joints
+    run = model._servos([{}], {})[0]
+    rate = np.gradient(run, model.p.grid, axis=1)
+    times = s.t[model._starts][:, None] + model.p.grid * np.arange(run.shape[1])
+    edges = np.append(times.ravel(), times[-1, -1] + model.p.grid)
+    target = s.tilt_targets(edges, s.delays({})[0]).reshape(run.shape)
+    return Servo.of(joint, effort_limit=None).motor(NUMPY, target - run, rate)

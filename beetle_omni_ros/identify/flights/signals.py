@@ -74,8 +74,6 @@ class Signals:
             if len(battery_t) > 1 else np.ones(len(self.t))
         if not (0.5 < self.voltage.min() and self.voltage.max() < 1.5):
             self.voltage = np.ones(len(self.t))
-        self.charge = np.interp(self.t, battery_t, battery[1]) \
-            if len(battery_t) else np.zeros(len(self.t))
         # Sensor effects and backlash of the robot file; deviations are added to them.
         self.file = {key: float(value) for name, values in robot.effects.items()
                      for parameter, given in values.items()
@@ -243,6 +241,22 @@ class Signals:
             force = lagged[places]
             return force, (mean[places + 1] - force) / tau
         return self._cached(('thrust', delay), theta, LAGS, make)
+
+    def state(self, effect, theta):
+        """State (N, 4) of the rotors by an effect with a rate, from zero at the first sample."""
+        entry = CATALOGUE[effect]
+        values = {key: value + theta.get(f'{effect}.{key}', 0.0) for key, value in {
+            **{key: parameter.neutral for key, parameter in entry.parameters.items()},
+            **self.robot.effects.get(effect, {})}.items()}
+
+        def make():
+            ratio = self.thrust(theta)[0] / self.robot.hover_thrust
+            state = np.zeros_like(ratio)
+            for k in range(1, len(state)):
+                state[k] = entry.advanced(values, state[k - 1], ratio[k - 1], self.p.grid)
+            return state
+        return self._cached(('state', effect, self.delays(theta)[1]), theta, (
+            *LAGS, *(f'{effect}.{key}' for key in values)), make)
 
     def _mean_commands(self, delay, limit):
         """Mean thrust commands (K, 4) between the steps of the rotor filter [N]."""

@@ -60,7 +60,7 @@ class TableFlight:
         channels: names of the channels that can be formed.
         mask: (N, C) samples that count.
         reasons: channel -> why it is not used; '' if it is used.
-        motion: velocity (world), quaternion, position, tilts and rates of the samples.
+        motion: velocity (world), quaternion, position, tilts, rates, thrusts of the samples.
         time: (N,) times of the samples [s].
         apart: why IMU and MoCap of this flight are not compared although both are there, or ''.
 
@@ -148,10 +148,11 @@ class TableFlight:
             reasons[3:] = ['no gyroscope'] * 3
         tilt = filled(v['tilt'], h)[0] if 'tilt' in v else np.zeros((n, 4))
         inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': rate, 'tilt': tilt,
-                  'thrust': np.zeros((n, 4)), 'tilt_rate': np.gradient(tilt, h, axis=0),
+                  'thrust': self._thrust({})[0], 'tilt_rate': np.gradient(tilt, h, axis=0),
                   'tilt_acceleration': np.zeros((n, 4)), 'thrust_rate': np.zeros((n, 4)),
-                  'position': position, 'voltage': np.ones(n), 'charge': np.zeros(n),
-                  'modules': np.zeros(n)}
+                  'position': position, 'voltage': np.ones(n),
+                  'modules': np.zeros(n),
+                  **{f'state of {name}': np.zeros((n, 4)) for name in self.body.slow}}
         return inputs, np.concatenate([force, turned], axis=1), reasons
 
     def _compared(self):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.identify.flights.bag_flight import BagFlight, starts_of
+from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.balance import Balance, SLOW
 from beetle_omni_ros.identify.flights.body import BodyModel, swing_of, tilting_modules
 from beetle_omni_ros.identify.flights.engine import Engine
@@ -30,6 +30,7 @@ from beetle_omni_ros.identify.flights.keys import (
     VARYING,
 )
 from beetle_omni_ros.identify.flights.results import ALPHA, concluded, result_of, Starts
+from beetle_omni_ros.identify.flights.servo import starts_of
 from beetle_omni_ros.identify.flights.signals import IMU_LAG
 from beetle_omni_ros.identify.flights.table_flight import COMPARED, GROUPS, TableFlight
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS

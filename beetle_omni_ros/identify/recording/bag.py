@@ -1,18 +1,14 @@
 """Recordings of bags: measured topics as arrays, in the order of recording; their damages."""
 
-from collections import defaultdict
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.bags.bag import BagError, read_columns, read_together
+from beetle_omni_ros.bags.bag import BagError, read_bag
 from beetle_omni_ros.bags.log import CHANNELS, FlightLog, SERIES
-from beetle_omni_ros.bags.messages import from_bytes
-from beetle_omni_ros.bags.topics import ALL
-from beetle_omni_ros.model.parameters import JOINT_NAMES, ROTOR_NAMES
+from beetle_omni_ros.model.parameters import JOINT_NAMES
 
 NEEDED = IMU, POSE, JOINTS, COMMAND = 'imu/data_raw', 'mocap/pose', 'joint_states', 'command'
 BATTERY = 'battery_state'
@@ -59,73 +55,23 @@ def read_recording(path: str | Path) -> Recording:
         BagError: no such bag, unreadable bag, several robots, or another robot.
 
     """
-    warnings: list[str] = []
-    states: list[tuple[float, str]] = []
-    data: dict[str, list] = defaultdict(list)
-    when: dict[str, list] = defaultdict(list)
-    known: set[str] = set()
-    bad: dict[str, int] = {}
-    for together in read_together(path, warnings):
-        for messages in together:
-            name, count = messages.topic, len(messages.data)
-            known.add(name)
-            if name not in PARTS and name != 'supervisor/state':
-                continue
-            if messages.type != ALL[name].type:
-                bad[name] = bad.get(name, 0) + count
-            elif name in PARTS:
-                data[name] += messages.data
-                when[name].append(messages.received)
-            else:
-                _note(states, messages)
-    times, values, received = {}, {}, {}
-    for name in PARTS:
-        rows, table, refused = read_columns(ALL[name], data[name], PARTS[name])
-        times[name] = table.pop('stamp')
-        values[name] = np.column_stack(list(table.values()))
-        received[name] = np.concatenate([np.zeros(0), *when[name]])[rows]
-        if refused:
-            bad[name] = bad.get(name, 0) + refused.total()
-    if not any(len(times[name]) for name in NEEDED):
-        found = ', '.join(sorted(known)) or 'no message'
-        raise BagError(f'{path}: no recording of this robot: expected {", ".join(NEEDED)} with '
-                       f'its joints and rotors, found {found}')
-    _check_members(path, data, times)
-    warnings += [f'{name}: {count} messages not readable' for name, count in bad.items()]
-    return Recording(Path(path).name, times, values, states, warnings, received)
+    log = read_bag(path)
+    if not len(log.joint) and not len(log.command):
+        raise BagError(f'{path}: no recording of this robot: expected {", ".join(NEEDED)}, with '
+                       f'joints {", ".join(JOINT_NAMES)}; {"; ".join(log.warnings)}')
+    return recording_of(log, Path(path).name)
 
 
 def recording_of(log: FlightLog, name: str) -> Recording:
-    """A flight in memory as it is read from a bag."""
+    """The series of a flight in the order of recording."""
     series = {topic: getattr(log, own) for own, (topic, _) in SERIES.items() if topic in PARTS}
+    order = {topic: np.argsort(own.received, kind='stable') for topic, own in series.items()}
     return Recording(
-        name, {topic: own.t for topic, own in series.items()},
-        {topic: np.column_stack([getattr(series[topic], channel) for channel in channels])
-         for topic, channels in PARTS.items()},
-        [(float(t), str(mode)) for t, mode in zip(log.state_t, log.states, strict=True)],
-        received={topic: own.received for topic, own in series.items()})
-
-
-def _note(states, messages):
-    for data, received in zip(messages.data, messages.received.tolist(), strict=True):
-        # A message that cannot be decoded costs one state, not the recording.
-        with suppress(Exception):
-            states.append((received, from_bytes(data, messages.type).data))
-
-
-def _check_members(path, data, times):
-    """Refuse joints and rotors of another robot, whose IMU and MoCap may have the same topics."""
-    named = [name for name in ('joint_states', 'command') if data[name]]
-    if not named or any(len(times[name]) for name in named):
-        return
-    for name in named:
-        try:
-            others = from_bytes(data[name][0], ALL[name].type).name
-        except Exception:       # a message that cannot be decoded
-            continue
-        if others and not {*JOINT_NAMES, *ROTOR_NAMES} & set(others):
-            raise BagError(f'{path}: no recording of this robot: {" and ".join(named)} hold '
-                           f'{", ".join(others)}, expected {", ".join(JOINT_NAMES)}')
+        name, {topic: own.t[order[topic]] for topic, own in series.items()},
+        {topic: np.column_stack([getattr(series[topic], channel)[order[topic]]
+                                 for channel in channels]) for topic, channels in PARTS.items()},
+        list(zip(log.state_t, log.states, strict=True)), list(log.warnings),
+        {topic: own.received[order[topic]] for topic, own in series.items()})
 
 
 @dataclass(frozen=True)
