@@ -319,12 +319,18 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
         return listen_to_ros(duration, namespace)
 
     from beetle_omni_ros.drivers.check import run_check
+    from beetle_omni_ros.show import page
     measure = None
     if timing:
         from beetle_omni_ros.flight.timing import check_timing as measure
-    return run_check(listen=listen, servo_port=servo_port, board_port=board_port,
-                     servo_bus=servo_bus, motor_board=motor_board, robot=robot, seconds=seconds,
-                     skip=tuple(skip), measure=measure, json_path=json_path)
+    status = run_check(listen=listen, servo_port=servo_port, board_port=board_port,
+                       servo_bus=servo_bus, motor_board=motor_board, robot=robot, seconds=seconds,
+                       skip=tuple(skip), measure=measure, json_path=json_path)
+    page.print_end(page.Terminal(), [json_path],
+                   'what the table says, then the same again' if status
+                   else ('check',) if timing or skip
+                   else 'the first flight with hardware, docs/tutorials/hardware_flight.md')
+    return status
 
 
 @app.command()

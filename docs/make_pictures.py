@@ -3,8 +3,9 @@ Fly and draw the pictures of the pages: ``python docs/make_pictures.py [NAME...]
 
 Without a name all are drawn that are stale: their function, the table of colours or a file that
 they read has changed. ``docs/pictures/inputs.json`` has the digests, and test/docs compares them.
-``hardware_flight`` needs ROS, films need an off-screen OpenGL. Those of OTHERS have another
-command, which is printed if they are stale; a name then records that it has been run.
+``hardware_flight`` needs ROS, films need an off-screen OpenGL, ``view`` a browser on the PATH.
+Those of OTHERS have another command, which is printed if they are stale; a name then records that
+it has been run.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import json
 import os
 from pathlib import Path
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -32,7 +34,7 @@ from beetle_omni_ros.flight.campaign import digest
 from beetle_omni_ros.identify.flights.picture import picture_of
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.show import figures, scene
+from beetle_omni_ros.show import figures
 from beetle_omni_ros.show.figures import AFTER, BEFORE, colours_of, FAINT, INK, PARTS, STYLE
 from beetle_omni_ros.show.recorded import recorded_scene
 
@@ -42,6 +44,11 @@ INPUTS = DOCS / 'pictures' / 'inputs.json'
 DOTS = 110      # per inch
 POSE = 8.0      # [s] of a pose
 TASK = 'random2'
+BROWSERS = 'chromium', 'chromium-headless-shell', 'google-chrome'
+SOFTWARE = '--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'
+PLAYS = "parseFloat(document.querySelector('.mantine-NumberInput-input')?.value) > 1"
+MOMENT = 0.165          # of the flight, between two waypoints
+WAIT, SETTLED = 120_000, 6_000  # ms
 
 
 def figure(columns, height=2.9):
@@ -188,6 +195,24 @@ def gap():
                 film.panel(log, 'corrected model', RobotParameters.load(corrected), AFTER)]
 
 
+def view():
+    """Photograph of `beetle_omni view` with both controllers at the waypoints."""
+    from playwright.sync_api import sync_playwright
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    with tempfile.TemporaryDirectory() as name, sync_playwright() as started:
+        page = Path(name) / 'page.html'
+        page.write_text(recorded_scene({name: bo.simulate(name) for name in ('rl', 'nmpc')}))
+        shown = started.chromium.launch(executable_path=browser, args=SOFTWARE).new_page(
+            viewport={'width': 1000, 'height': 560})
+        shown.goto(page.as_uri(), timeout=WAIT)
+        shown.wait_for_function(PLAYS, timeout=WAIT)
+        shown.locator('button.mantine-ActionIcon-root').first.click()   # pause
+        bar = shown.locator('.mantine-Slider-track').bounding_box()
+        shown.mouse.click(bar['x'] + MOMENT * bar['width'], bar['y'] + bar['height'] / 2)
+        shown.wait_for_timeout(SETTLED)
+        return shown.screenshot(timeout=WAIT)
+
+
 # Picture below docs/ -> its function, and the files that it reads.
 TUTORIALS, SHIPPED = 'tutorials/pictures', ('policies/rl.onnx', 'params/robot.yaml')
 PICTURES: dict[str, tuple[Callable, tuple[str, ...]]] = {
@@ -198,6 +223,8 @@ PICTURES: dict[str, tuple[Callable, tuple[str, ...]]] = {
         (real_gap, ('params/crazyflie.yaml', 'test/data/nanobench/*.csv.gz')),
         (hardware_flight, ()))},
     'pictures/flight.gif': (flight, SHIPPED), 'pictures/gap.gif': (gap, SHIPPED),
+    'pictures/view.png': (view, ('beetle_omni_ros/show/scene.py',
+                                 'beetle_omni_ros/show/viewer.html')),
     **{f'pictures/{made.__name__}.svg': (made, read) for made, read in (
         (drawings.architecture, ('beetle_omni_ros/ros/graph.py',)),
         (drawings.real_flights, ('params/crazyflie.yaml', 'test/data/nanobench/*.csv.gz')),
@@ -206,9 +233,7 @@ PICTURES: dict[str, tuple[Callable, tuple[str, ...]]] = {
 OTHERS: dict[str, tuple[str, tuple[Callable, ...]]] = {
     'comparison/*_convergence_*.png': ('make compare', (
         comparison_page.convergence, figures.legend)),
-    'comparison/*_errors_*.png': ('make compare', (comparison_page.in_time, figures.legend)),
-    'pictures/view.png': ('beetle_omni view RUN RUN, photographed in a browser', (
-        scene.Room, recorded_scene))}
+    'comparison/*_errors_*.png': ('make compare', (comparison_page.in_time, figures.legend))}
 
 
 def sources(function: Callable) -> str:
@@ -268,6 +293,8 @@ def main(names):
                     made.savefig(DOCS / name, dpi=DOTS, **(
                         {'metadata': {'Date': None}} if name.endswith('svg') else
                         {'pil_kwargs': {'optimize': True}}))
+                elif isinstance(made, bytes):
+                    (DOCS / name).write_bytes(made)
                 else:
                     film.write(DOCS / name, made)
         elif not names:     # a name confirms that it was drawn

@@ -126,8 +126,8 @@ def _error_curve(panel, result, what, name, height):
     return float(np.max(shown)) if shown.size else 0.0
 
 
-_POSES = [('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band over all '
-           'poses', convergence)]
+_POSES = [('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band',
+           convergence)]
 _TIME = [('errors', 'Errors in time in the first flight, the disturbance dashed; × where control '
           'was lost', in_time)]
 # Kind of a task -> name, caption and function of each figure.

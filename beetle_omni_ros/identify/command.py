@@ -113,7 +113,8 @@ def run_identify(what: str, paths: Sequence[Path], *, validate: Sequence[Path] =
         about = f'identified for {params.name}' if params and whole else \
             f'identified from {", ".join(log.name for log in [*joints, *rotors])}'
         write_text(report, page(TITLES[what], about, tables, texts, sections), 'report')
-    print_end(console, [params, report, json_path], ('evaluate', '--plant', params)
+    print_end(console, [params, report, json_path],
+              *([f'open {report} in a browser'] if report else []), ('evaluate', '--plant', params)
               if params else 'the same with --params FILE writes a robot file')
     return results
 

@@ -42,6 +42,7 @@ NODES = {'sim_node': 'sim_node:SimNode', 'ekf_node': 'nodes:ekf_node',
 AUTOSTART = {'none': '', 'configure': 'inactive', 'activate': 'active'}
 COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes
 STOP_TIMEOUT = 8.0      # s from SIGINT to SIGKILL
+TIMES = re.compile(r'[\d.]+ (?=m?s\b)')     # in a text
 Parameters = dict[str, dict]        # node name -> parameters that differ from the shipped ones
 
 # --- discovery --------------------------------------------------------------------------------
@@ -329,11 +330,15 @@ class Graph:
         return [line for _, line in sorted(timed, key=itemgetter(0))]
 
     def warnings(self) -> list[str]:
-        """Return logged warnings and errors, without duplicates, in the order of their times."""
+        """
+        Return logged warnings and errors in the order of their times.
+
+        Of those that differ only in a time, such as an age, the first one counts for all.
+        """
         lines: dict[str, str] = {}
         for line in self.lines():
             if '[WARN]' in line or '[ERROR]' in line or ': error: ' in line:
-                lines.setdefault(line.split(']: ', 1)[-1], line)
+                lines.setdefault(TIMES.sub('', line.split(']: ', 1)[-1]), line)
         return list(lines.values())
 
 

@@ -168,10 +168,10 @@ class Newest(Recorder):
 
 def draw(server: viser.ViserServer, graph) -> None:
     """Draw a :class:`~beetle_omni_ros.ros.clients.LiveGraph` as it runs, until Ctrl-C."""
+    server.gui.add_html(rendered('viewer.html', live=True))     # first: dark mode loads it again
     newest, room = Newest(), Room(server)
     label = server.scene.add_label('/label', '', anchor='bottom-center',
                                    position=(0.0, 0.0, LABEL_HEIGHT))
-    server.gui.add_html(rendered('viewer.html', live=True))
     follow = server.gui.add_checkbox('Follow the robot', True)
     shown = server.gui.add_markdown('')
     trail, path = np.zeros((0, 3)), None

@@ -144,10 +144,15 @@ def test_warnings_are_in_the_order_of_time_each_once(tmp_path):
     graph = Graph({}, tmp_path, 0)
     graph.processes = {'one': None, 'two': None}
     graph.log('one').write_text('[WARN] [20.5] [a]: late\n[INFO] [21.0] [a]: no matter\n'
-                                '[ERROR] [22.0] [b]: early\n')
-    graph.log('two').write_text('[ERROR] [19.0] [b]: first\n[WARN] [23.0] [b]: late\n')
+                                '[ERROR] [22.0] [b]: early\n'
+                                '[WARN] [23.5] [a]: id 1: old, 62 ms\n')
+    graph.log('two').write_text('[ERROR] [19.0] [b]: first\n[WARN] [23.0] [b]: late\n'
+                                '[WARN] [24.0] [b]: id 1: old, 7.5 ms\n'
+                                '[WARN] [25.0] [b]: id 2: old, 7.5 ms\n')
     assert graph.warnings() == ['[ERROR] [19.0] [b]: first', '[WARN] [20.5] [a]: late',
-                                '[ERROR] [22.0] [b]: early']
+                                '[ERROR] [22.0] [b]: early',
+                                '[WARN] [23.5] [a]: id 1: old, 62 ms',
+                                '[WARN] [25.0] [b]: id 2: old, 7.5 ms']
 
 
 @pytest.mark.parametrize('speed', [0.3, 3.0])

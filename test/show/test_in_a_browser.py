@@ -5,6 +5,7 @@ from pathlib import Path
 import shutil
 
 import numpy as np
+from PIL import Image
 import pytest
 from rich.console import Console
 from rotor_logs import bench
@@ -19,6 +20,7 @@ from beetle_omni_ros.show.report import run_report
 
 ROOT = Path(__file__).parents[2]
 LONG = 'a text of many words that says what was found and what to do about it ' * 3
+BROWSERS = 'chromium', 'chromium-headless-shell', 'google-chrome'
 # Software rendering, so that a scene is drawn on any computer.
 ARGUMENTS = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader']
 CUT_OFF = """() => [...document.querySelectorAll('main *')].filter(e => {
@@ -31,7 +33,7 @@ CUT_OFF = """() => [...document.querySelectorAll('main *')].filter(e => {
 @pytest.fixture(scope='module')
 def chromium():
     playwright = pytest.importorskip('playwright.sync_api', reason='playwright is not installed')
-    path = shutil.which('chromium') or shutil.which('google-chrome')
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
         pytest.skip('no browser on the PATH')
     with playwright.sync_playwright() as started:
@@ -113,3 +115,7 @@ def test_a_page_is_complete_without_errors(chromium, made, tmp_path):
         assert shown.evaluate('document.documentElement.scrollWidth') == width
         assert shown.locator('section').count() >= 1 and not shown.evaluate(CUT_OFF)
     assert not wrong
+    shown.emulate_media(color_scheme='dark')
+    shown.evaluate("document.querySelector('img')?.scrollIntoView()")
+    shot = Image.open(io.BytesIO(shown.screenshot(timeout=120_000)))
+    assert np.mean(shot.convert('L')) < 128     # darker than middle grey, its pictures too

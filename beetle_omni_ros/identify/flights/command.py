@@ -117,20 +117,24 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
     if corrected:
         write_corrected(corrected, result, model, robot, tolerances)
     _print(console, result)
-    print_end(console, (corrected, written, page, json_path), (
-        'evaluate', '--robot', corrected) if corrected
-              else 'no robot file, because no effect is named' if apply else
-              f'the same with --report FILE writes a page, with {_further(result, learn)}')
+    print_end(console, (corrected, written, page, json_path),
+              *([f'open {page} in a browser'] if page else []),
+              ('evaluate', '--robot', corrected) if corrected
+              else 'no robot file, because no effect is named' if apply
+              else 'the same with ' + ', with '.join(_further(result, page, learn)))
     return result
 
 
-def _further(result, learn):
-    """Option that may come next, and what it writes."""
+def _further(result, page, learn):
+    """Options that may come next, and what they write."""
+    if not page:
+        yield '--report FILE writes a page'
     if result['effects']:
-        return '--apply FILE a robot file'
-    if result['held_out'] and not learn and 'joints' not in result:
-        return '--learn FILE an effect that no entry has'
-    return '--json FILE all numbers'
+        yield '--apply FILE writes a robot file'
+    elif result['held_out'] and not learn and 'joints' not in result:
+        yield '--learn FILE writes an effect that no entry has'
+    else:
+        yield '--json FILE writes all numbers'
 
 
 def _tables(runs, holdout, robot, p, form, alpha, progress, then):

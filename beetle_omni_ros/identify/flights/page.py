@@ -33,6 +33,11 @@ def label(effect: dict) -> str:
     return names + (f' {member}' if member else '')
 
 
+def first_label(effect: dict) -> str:
+    """Name of the first of the entries that an effect may be, with its rotor or joint."""
+    return label({**effect, 'names': effect['names'][:1], 'members': []})
+
+
 def summary(result: dict) -> str:
     """The verdict as one or two sentences."""
     verdict, reason = result['verdict'], result['reason']
@@ -157,8 +162,9 @@ def _effects(result):
     rows = []
     for effect in result['effects'] or result['partial']:
         ln = f"{effect['evidence']['ln_bayes_factor']:.0f}"
-        for first, one in [(label(effect), effect), *(
-                (f'or {label(rival)}', rival) for rival in effect.get('rivals', []))]:
+        rivals = effect.get('rivals', [])
+        for first, one in [(first_label(effect) if rivals else label(effect), effect), *(
+                (f'or {label(rival)}', rival) for rival in rivals)]:
             for k, (name, entry) in enumerate(one['parameters'].items()):
                 rows.append(['' if k else first, f"{name} [{entry['unit']}]",
                              _numbers(entry['value']), _spans(entry.get('interval')),

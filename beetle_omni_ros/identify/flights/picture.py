@@ -8,7 +8,14 @@ import matplotlib
 from matplotlib.figure import Figure
 import numpy as np
 
-from beetle_omni_ros.identify.flights.page import evidence, grids, headline, label, seen, whole
+from beetle_omni_ros.identify.flights.page import (
+    evidence,
+    first_label,
+    grids,
+    headline,
+    seen,
+    whole,
+)
 from beetle_omni_ros.identify.recording.bag import Recording
 from beetle_omni_ros.identify.recording.topics import begin_of
 from beetle_omni_ros.show import figures
@@ -98,13 +105,15 @@ def _sizes(effects):
     """Name, deviation and its interval of each number, over its typical deviation."""
     result = []
     for effect in effects:
+        several = len(effect.get('members', effect['names'])) > 1
+        text = first_label(effect) + ' or …' * several
         for name, found in effect['parameters'].items():
             values, file = np.atleast_1d(found['value']), np.atleast_1d(found['file'])
             spans = np.reshape(found['interval'], (-1, 2))
             for k, (value, own, span) in enumerate(zip(values, file, spans, strict=True)):
                 more = f' {"xyz"[k]}' if len(values) == 3 else ''
-                result.append((f'{label({**effect, "names": effect["names"][:1]})}\n{name}{more}',
-                               *((x - own) / found['typical'] for x in (value, *span))))
+                result.append((f'{text}\n{name}{more}', *(
+                    (x - own) / found['typical'] for x in (value, *span))))
     return result
 
 
