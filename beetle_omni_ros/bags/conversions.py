@@ -24,6 +24,7 @@ from beetle_omni_ros.model.allocation import ActuatorHealth
 from beetle_omni_ros.model.mode import Mode
 from beetle_omni_ros.model.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.model.rotations import BodyState
+from beetle_omni_ros.model.schema import shortened
 
 WORLD, BODY = 'world', 'base_link'
 JOINTS, ROTORS = list(JOINT_NAMES), list(ROTOR_NAMES)
@@ -235,8 +236,8 @@ def _of(message, field, names):
             [message.name.index(name) for name in names]
         return np.array([values[k] for k in order], dtype=float).T
     except ValueError:
-        raise MessageError(f"names are {', '.join(map(str, message.name[:8]))}, "
-                           f"not {', '.join(names)}") from None
+        found, wanted = shortened(', '.join(map(str, message.name)), 60), ', '.join(names)
+        raise MessageError(f'names are {found}, not {wanted}', f'names are not {wanted}') from None
     except IndexError:
         raise MessageError(f'{field} has too few values for the names') from None
 
