@@ -201,9 +201,7 @@ class BagFlight:
         before, run = s.model_tilts, self._runs.get(frozenset(theta.items()))
         if before is None or run is None:
             return self.residual(theta, groups)
-        tilts = before.copy()
-        tilts[self._starts[0]:self._starts[0] + run.size // 4] = run.reshape(-1, 4)
-        s.use_model_tilts(tilts)
+        self._use_tilts(before, run)
         result = self.residual(theta, groups)
         s.use_model_tilts(before)
         return result
@@ -309,11 +307,14 @@ class BagFlight:
         s, theta = self.signals, self._real(theta)[0]
         if s.reading_noise < self.p.guide_above:
             return
-        run = self._servos([theta], theta)[0].reshape(-1, 4)
-        tilts = s.joints(theta)[0].copy()
-        tilts[self._starts[0]:self._starts[0] + len(run)] = run
-        s.use_model_tilts(tilts)
+        self._use_tilts(s.joints(theta)[0], self._servos([theta], theta)[0])
         self._kept = None, None
+
+    def _use_tilts(self, tilts, run):
+        """Take the fast tilts from simulated servos, beside their windows from ``tilts``."""
+        tilts, first = tilts.copy(), self._starts[0]
+        tilts[first:first + run.size // 4] = run.reshape(-1, 4)
+        self.signals.use_model_tilts(tilts)
 
     @property
     def motion(self) -> dict[str, np.ndarray]:
