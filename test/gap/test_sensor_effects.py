@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.identify.flights.keys import all_keys, extra_keys, names_of
+from beetle_omni_ros.identify.flights.keys import all_keys, extra_keys, names_of, Prior
+from beetle_omni_ros.identify.flights.linearised import Linearised
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.recording.bag import changed, JOINTS
 from beetle_omni_ros.model.effects import CATALOGUE, ignored
@@ -128,6 +129,15 @@ def test_tilts_follow_the_servo_model_if_encoders_are_noisy():
     after = [made.signals.joints({})[k] - truth[j] for j, k in enumerate((0, 2))]
     assert rms(after[0][inside]) < 0.35 * rms(before[0][inside])
     assert rms(after[1][inside]) < 0.05 * rms(before[1][inside])
+
+
+@pytest.mark.parametrize('noise, hidden', [(0.0, set()), (0.003, {4, 5, 6, 7})])
+def test_encoder_noise_hides_joints_in_the_bands_in_which_they_do_not_move(noise, hidden):
+    # tilts move below 0.5 Hz, bands 4 to 7 begin at 1 Hz
+    flights = Linearised([model(noisy(noise))], {DELAY: Prior(6e-4, 0.01, 0.0)}, [])
+    flights._whiten(np.zeros(len(flights.names)), np.zeros((1, len(flights.names))))
+    still = {band for band, own in flights.still[0] if flights.channels[own[0]] == 'joint_1'}
+    assert hidden <= still and not still & ({1, 2} | (set() if noise else {3, 4, 5, 6, 7}))
 
 
 @pytest.mark.parametrize('gain', ['kp', 'kd'])

@@ -217,6 +217,14 @@ class BagFlight:
         return np.concatenate([body[self.rows], seen[self.rows], self._of_joints(
             self.signals.joints(theta)[3][first:first + count])], axis=1)
 
+    def reading_noise(self) -> np.ndarray:
+        """(M, 16) drawn noise of the encoders, as large as that of their readings; others: 0."""
+        noise = np.zeros((len(self.rows), len(self.channels)))
+        first, count = self._starts[0], self._length * len(self._starts)
+        noise[:, PLACE['J']] = self._of_joints(self.signals.drawn_reading_noise()[
+            first:first + count])
+        return noise
+
     def _groups_of(self, start):
         """Groups that a start acts on; with tilts of a servo model, servos act on the body."""
         groups = self.keys[next(iter(self.starts[start]))].groups

@@ -173,7 +173,8 @@ class Linearised:
 
         A controller at rest answers noise. Then motion and commands correlate with the noise of
         the sensors, and a fit takes the answer for the robot. Where IMU and MoCap show that the
-        robot turns, what the model leaves is no noise, and counts.
+        robot turns, what the model leaves is no noise, and counts. Joints may rest there, and
+        the noise of their readings, which is known, hides them.
         """
         spectra = self._spectra(theta, etas)
         fit, equations = self._learn(spectra)
@@ -182,19 +183,25 @@ class Linearised:
             measured = self._linear(flight, self._at(k, theta + etas[k])).measured
             whole = self.transformed(k, measured).residual
             rest = each.at(fit + equations.of_flight(k, fit))
-            bands = {}
-            for kind, own in self._in_loop():
-                left, total = ([float((x[:, each.band == band][..., own]**2).sum())
-                                for band in DYNAMIC] for x in (rest, whole))
-                bands[kind] = [band for band, a, b in zip(DYNAMIC, left, total, strict=True)
-                               if a >= (1 - MOVED) * b]
+            bands = {kind: self._hidden(each, own, rest, whole) for kind, own in self._in_loop()}
             if not flight.turning:      # what the model lacks is more than the noise
                 bands = {'torque': bands.get('torque', [])}
             elif len(bands[flight.turning]) < len(DYNAMIC):
                 bands |= dict.fromkeys(('force', 'torque', 'joint'), [])
+            if flight.turning:      # its answer biases gains by less than servos differ
+                noise = self.transformed(k, flight.reading_noise()).residual
+                bands['joint'] = sorted({*bands['joint'], *self._hidden(
+                    each, dict(self._in_loop())['joint'], noise, whole,
+                    flight.p.tolerance_lag**2)})
             found.append([(band, own) for kind, own in self._in_loop()
                           for band in bands.get(kind, [])])
         return found
+
+    def _hidden(self, spectrum, own, rest, whole, most=1 - MOVED):
+        """Bands in which ``rest`` is more than this share of the channels ``own`` of ``whole``."""
+        powers = [[float((x[:, spectrum.band == band][..., own]**2).sum()) for x in (rest, whole)]
+                  for band in DYNAMIC]
+        return [band for band, (a, b) in zip(DYNAMIC, powers, strict=True) if a >= most * b]
 
     def _filter(self, spectrum, noise):
         power = np.diagonal(noise, axis1=1, axis2=2)[:spectrum.band[-1] + 1]

@@ -197,6 +197,13 @@ class Signals:
             return tuple(self._smooth(fine, self.p.smooth_joint, k) for k in range(3)) + (raw,)
         return self._cached('joints', theta, names, make)
 
+    def drawn_reading_noise(self):
+        """(N, 4) white noise of readings of the encoders, drawn and smoothed as these are."""
+        times = self._joint.x
+        drawn = self.reading_noise * np.random.default_rng(0).standard_normal((len(times), 4))
+        return self._smooth(CubicSpline(times, drawn)(np.clip(
+            self._fine, times[0], times[-1])), self.p.smooth_reading)
+
     def _fused_tilts(self, model_tilts, raw, gap):
         """Angle, rate, acceleration (N, 4): slow part from encoders, fast part from the model."""
         p, derivatives_of_model = self.p, self._model_derivatives

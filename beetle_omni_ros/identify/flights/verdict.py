@@ -157,10 +157,11 @@ def _delays(robot, p, coarse):
     Beyond a limit, a deviation is a finding. ``coarse`` sensors are also late.
     """
     bus, imu = (-p.command_delay, p.bus_late), p.coarse_imu if coarse else p.imu_averaging
+    stamps = 2 * p.tolerance_delay      # a reading of the latest IMU may be as much later
     swing = swing_of(robot)
     deviations = {TILT_BUS: p.bus_near, THRUST_BUS: p.bus_near, IMU_LAG: imu,
                   SWING: p.tolerance_swing + swing}
-    limits = {TILT_BUS: bus, THRUST_BUS: bus, IMU_LAG: (0.0, imu),
+    limits = {TILT_BUS: bus, THRUST_BUS: bus, IMU_LAG: (0.0, imu + stamps),
               SWING: (-p.tolerance_swing, swing + p.tolerance_swing)}
     if coarse:
         deviations['joint_feedback_delay.delay'] = p.coarse_encoders
