@@ -115,6 +115,15 @@ def test_derivatives_by_a_delay_contain_no_encoder_noise(name):
     assert rms(slopes[1] - slopes[0]) < 0.02 * rms(clean)
 
 
+def test_what_all_sensors_and_commands_are_late_by_is_not_seen():
+    # else a linear fit would exploit the difference between equivalent delays
+    late = {'imu_filter_lag.delay': -1, 'mocap_time_offset.delay': -1, DELAY: -1,
+            'base.tilt_delay': 1, 'base.thrust_delay': 1}
+    parts = model(MOTION.flight()).linear({}, list(late)).slopes * list(late.values())
+    for own in PLACE.values():
+        assert rms(parts[:, own].sum(axis=2)) < 2e-3 * rms(parts[:, own])
+
+
 def test_the_delay_of_noisy_encoders_is_recovered():
     found = solved(model(noisy(0.02, joint_delay=0.012)), [DELAY], 'J')
     assert found[DELAY] == pytest.approx(0.012, abs=1e-3)

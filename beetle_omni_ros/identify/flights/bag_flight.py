@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.flights.body import BodyModel
-from beetle_omni_ros.identify.flights.keys import delays_of, Key
+from beetle_omni_ros.identify.flights.keys import delays_of, Key, TILT_BUS
 from beetle_omni_ros.identify.flights.servo import (
     module_load,
     simulate,
@@ -349,23 +349,25 @@ class BagFlight:
         """
         Derivatives (M, 4) of the joints' residual by each key.
 
-        The derivative by an encoder delay uses the rate of the simulated servo. The rate of the
-        encoder would explain its own noise, shifted in time.
+        Late encoders are as late commands: the derivative by both is the same, that of the
+        simulated servo. The rate of the encoders would explain their own noise, shifted in time,
+        and a linear fit would exploit any difference between equivalent delays.
         """
         # Servos are independent, so one run with all gains changed gives the slope of each.
         sources = [f'joint_bandwidth.{self.keys[name].parameter}'
                    if self.keys[name].effect == 'servo' else name for name in names]
-        moved = list(dict.fromkeys(sources))
+        moved = list(dict.fromkeys([TILT_BUS, *sources]))
         sizes = [self.keys[name].step for name in moved]
         # Central differences: gains, loads and inertia scaled by one factor leave the motion
         # unchanged, and with one-sided differences their slopes would not add up to zero.
         sets = [theta, *({**theta, name: theta.get(name, 0.0) + side * h}
                          for side in (1, -1) for name, h in zip(moved, sizes, strict=True))]
         runs = self._servos(sets, theta)
-        rate, slopes = np.gradient(runs[0], self.p.grid, axis=1), {}
         ahead, behind = runs[1:].reshape(2, len(moved), *runs[0].shape)
-        for name, change in zip(moved, ahead - behind, strict=True):
-            slope = rate * SHIFTS.get(name, 0.0) - change / (2 * self.keys[name].step)
+        sizes = np.array(sizes).reshape(-1, 1, 1, 1)
+        changes, slopes = dict(zip(moved, (behind - ahead) / (2 * sizes), strict=True)), {}
+        for name, change in changes.items():
+            slope = changes[TILT_BUS] * SHIFTS.get(name, 0.0) + change
             slopes[name] = self._of_joints(slope.reshape(-1, 4))
         return [slopes[source] * (np.arange(4) == self.keys[name].index)
                 if source != name else slopes[name]
