@@ -1,0 +1,335 @@
+"""
+Formulas of `gap --learn` against hidden forces: ``python benchmarks/formulas.py --seed 0``.
+
+Each body and rotor entry is left out of the catalogue and hidden in three flights, and so are ten
+families outside it; undisturbed plants have no law. True force and formula follow from the true
+states of the third flight, which no fit has seen. ``--baseline`` adds plain sparse regression of
+the same terms (pysindy). The same command continues an interrupted run.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+import importlib.util
+import json
+from pathlib import Path
+import tempfile
+from time import process_time
+
+import casadi as ca
+import numpy as np
+from rich.console import Console
+from scipy.signal import lfilter
+
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.flight.campaign import digest, SOURCE, Store, sweep
+from beetle_omni_ros.flight.evaluate import prepared
+from beetle_omni_ros.identify.flights.bag_flight import BagFlight
+from beetle_omni_ros.identify.flights.body import BodyModel, tilting_modules
+from beetle_omni_ros.identify.flights.command import gap_results
+from beetle_omni_ros.identify.flights.keys import all_keys, ARM, extra_keys, LIMITS
+from beetle_omni_ros.identify.flights.page import label
+from beetle_omni_ros.identify.flights.treatment import TREATMENTS
+from beetle_omni_ros.identify.recording.bag import read_recording
+from beetle_omni_ros.identify.recording.flight import prepare
+from beetle_omni_ros.identify.recording.parameters import GapParameters
+from beetle_omni_ros.model import dynamics
+from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model.formula import library, SHARE, size_of
+from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.terms import Effect, EffectParameter
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+
+LIKE, CLOSED = 0.95, 0.8    # least correlation and closure of a law that is rediscovered
+LOW = 0.3                   # [m] the flight above counts
+UNDISTURBED = 'undisturbed'
+WIDTHS = {'position': 3, 'velocity': 3, 'quaternion': 4, 'angular_velocity': 3, 'tilt': 4,
+          'tilt_rate': 4, 'thrust': 4, 'voltage_ratio': 1, 'tilt_acceleration': 4,
+          'thrust_rate': 4}
+X, Y, Z = (ca.DM(row) for row in np.eye(3))
+
+
+def near(t, i, way, place):
+    """Inverse square of the distance of a rotor from a wall or ceiling, 1 at 0.25 m."""
+    return (0.25 / ca.fmax(place - ca.dot(way, t.position + t.rotation @ t.rotor_positions[i]),
+                           0.2))**2
+
+
+def beside(t, i, j):
+    """Cosine between the jet of rotor j and the way from there to rotor i; 0: it blows away."""
+    way = t.rotor_positions[i] - t.rotor_positions[j]
+    return ca.fmax(-ca.dot(way, t.thrust_directions[j]), 0) / ca.norm_2(way)
+
+
+# Name -> least size, and the force in world [N] of terms and size. All in SI units.
+FORCES = {
+    # elastic cord to a hook 3 m above the origin, slack below 1.2 m (Hooke)
+    'tether': (0.8, lambda t, k: k * (3 * Z - t.position) * ca.fmax(
+        1 - 1.2 / ca.norm_2(3 * Z - t.position), 0)),
+    # weight of the lifted part of a cable
+    'power_cable': (0.05, lambda t, k: -9.80665 * k * t.position[2] * Z),
+    # drag between the laws of Stokes and Newton
+    'power_drag': (0.6, lambda t, k: -k * t.velocity * ca.sumsqr(t.velocity)**0.25),
+    # pressure on a flat plate in the plane of the arms
+    'plate': (0.5, lambda t, k: -k * t.rotation[:, 2] * ca.dot(t.rotation[:, 2], t.velocity)
+              * ca.fabs(ca.dot(t.rotation[:, 2], t.velocity))),
+    # a fan blows along x, Gaussian with a deviation of 0.5 m
+    'jet': (1.0, lambda t, k: k * X * ca.exp(-2 * ca.sumsqr(
+        t.position[1:] - ca.DM([0.3, 1.2])))),
+    # rotors draw the air from between themselves and a wall at y = 2 m
+    'wall': (0.6, lambda t, k: k * Y * sum(t.thrust[i] * near(t, i, Y, 2.0) for i in range(4)))}
+# Name -> least size, and the factor of the thrust of rotor i.
+GAINS = {
+    # as near the ground, of 2.6 m height
+    'ceiling': (0.5, lambda t, k, i: 1 + k * near(t, i, Z, 2.6)),
+    # a tilted neighbour disturbs the inflow
+    'neighbour_tilt': (0.08, lambda t, k, i: 1 - k * ca.sin(t.tilt[(i + 1) % 4])**2),
+    # less thrust in the jets of the others
+    'wake': (0.1, lambda t, k, i: 1 - k * sum(
+        beside(t, i, j)**4 * t.thrust[j] / t.hover_thrust for j in range(4) if j != i)),
+    # blades twist under load
+    'twist': (0.1, lambda t, k, i: (ca.fmax(t.thrust[i], 0.01) / t.hover_thrust)**-k)}
+
+
+def family(name):
+    """Effect of a force or of factors of thrust, for the catalogue."""
+    def apply(t, size):
+        if name in FORCES:
+            t.force_world = t.force_world + FORCES[name][1](t, size)
+        else:
+            t.thrust = t.thrust * ca.vertcat(*(GAINS[name][1](t, size, i) for i in range(4)))
+    return Effect('body', {'size': EffectParameter('SI', 0.0, 0.0, 10.0)}, name, apply)
+
+
+KINDS = {'left_out': [name for name, entry in CATALOGUE.items() if name in TREATMENTS
+                      and entry.layer in ('body', 'rotor') and entry.each != 'term'],
+         'outside': [*FORCES, *GAINS], UNDISTURBED: [UNDISTURBED]}
+
+
+def drawn(name, robot, rng):
+    """Parameters of an effect of 1 to 2 typical sizes, of a random sign or direction."""
+    factor = rng.uniform(1, 2)
+    if name in KINDS['outside']:
+        return {'size': factor * (FORCES | GAINS)[name][0]}
+    keys = [key for key in all_keys(robot).values() if key.effect == name and not key.form]
+    way = rng.normal(size=len(keys)) if keys[-1].index else rng.choice([-1.0, 1.0]) * np.ones(
+        len(keys))
+    way /= np.linalg.norm(way) if keys[-1].index else 1.0
+    if CATALOGUE[name].each:        # of one rotor
+        way = np.sign(way) * (np.arange(len(keys)) == rng.integers(len(keys)))
+    if CATALOGUE[name].delays or name in LIMITS:
+        way = np.array([1.0 if CATALOGUE[name].delays else -1.0])
+    made = {}
+    for key, part in zip(keys, way, strict=True):
+        spec, more = CATALOGUE[name].parameters[key.parameter], factor * part * key.typical
+        made.setdefault(key.parameter, []).append(key.value(
+            more if spec.low <= key.value(more) <= spec.high else -more))
+    return {key: tuple(each) if len(each) > 1 else each[0] for key, each in made.items()}
+
+
+def fly(controller, robot, plant, seed, bag):
+    """True states at 200 Hz above LOW, name -> (N, width), and the thrusts of other robots."""
+    loop, rows = prepared(controller, robot=robot, plant=plant, seed=seed, bag=bag), []
+
+    def note():
+        true = loop.simulator.truth
+        rows.append(np.hstack([
+            true.position, true.velocity, true.quaternion, true.angular_velocity, true.tilt,
+            true.tilt_velocity, true.thrust / plant.thrust_scale,
+            loop.simulator.battery.voltage / plant.battery.full_voltage, true.stamp]))
+    loop.before_messages = note
+    try:
+        if not loop.fly(make_task('random5', seed)):
+            raise RuntimeError('the flight is lost')
+        command = loop.recording().command
+    finally:
+        loop.close()
+    *states, t = np.split(np.array(rows), np.cumsum(list(WIDTHS.values())[:8]), axis=1)
+    made = dict(zip(WIDTHS, states, strict=False))
+    step, t = loop.simulator.tick, t[:, 0]
+    made |= {'tilt_acceleration': np.gradient(made['tilt_rate'], step, axis=0),
+             'thrust_rate': np.gradient(made['thrust'], step, axis=0)}
+    high = made['position'][:, 2] > LOW
+
+    def flown(other=None):
+        """The states, with the thrusts with which another robot answers the same commands."""
+        if other is None:
+            return {name: values[high] for name, values in made.items()}
+        late = SimulatorParameters.load().command_delay + other.command_delays[1]
+        at = np.clip(np.searchsorted(command.t + late, t - 1e-6, side='right') - 1, 0, None)
+        aim = np.clip(command.thrust[at], other.rotors.thrust_min, other.rotors.thrust_max)
+        gain = -np.expm1(-step / other.rotors.time_constant)
+        thrust = lfilter([0, gain], [1, gain - 1], aim, axis=0)
+        return flown() | {'thrust': thrust[high], 'thrust_rate': (
+            (aim - thrust) / other.rotors.time_constant)[high]}
+    return flown
+
+
+def wrench(robot, base, states):
+    """(N, 6) force and torque over arm [N] in base_link of a robot file."""
+    x = {name: ca.SX.sym(name, width) for name, width in WIDTHS.items()}
+    acceleration, turning = dynamics.rigid_body(robot, **x)
+    made = ca.Function('wrench', list(x.values()), [ca.vertcat(
+        base.mass * dynamics.rotation_matrix(x['quaternion']).T @ acceleration,
+        ca.DM(base.inertia) * turning / ARM)])
+    return np.array(made.map(len(states['thrust']))(*(states[name].T for name in x))).T
+
+
+def correlation(true, found):
+    """Of two wrenches (N, 6), less the mean of each component."""
+    a, b = (each - each.mean(axis=0) for each in (true, found))
+    return float((a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-9))
+
+
+def with_formula(robot, found):
+    """The robot with a formula, term -> coefficient."""
+    return replace(robot, effects={'formula': {
+        'expressions': tuple(found), 'coefficients': tuple(found.values())}} if found else {})
+
+
+def sparse(bags, robot):
+    """Formula of two flights by sequentially thresholded least squares, as the library comes."""
+    from pysindy import STLSQ
+    terms, p, weight = library(), GapParameters.load(), robot.mass * robot.gravity
+    known = with_formula(robot, dict.fromkeys(terms, 0.0))
+    keys = {**all_keys(known), **extra_keys()}
+    body, sizes = BodyModel(known, keys, tilting_modules(robot)), np.array([
+        size_of(term, weight, ARM) for term in terms])
+    units = np.array([robot.mass] * 3 + list(robot.inertia / ARM)) / (SHARE * weight)
+    x, y = [], []
+    for bag in bags:
+        made = BagFlight(prepare(read_recording(bag), robot, p, False), known, body, keys, p)
+        made.modules = float(robot.multibody is not None)
+        linear = made.linear({}, [f'formula.coefficients[{k}]' for k in range(len(terms))])
+        y.append((units * linear.residual[:, :6])[made.mask[:, 0]].ravel())
+        x.append(-(units[:, None] * linear.slopes[:, :6] * sizes)[made.mask[:, 0]].reshape(
+            -1, len(terms)))
+    found = STLSQ().fit(np.concatenate(x), np.concatenate(y)[:, None]).coef_.ravel() * sizes
+    return {term: float(k) for term, k in zip(terms, found, strict=True) if k}
+
+
+@dataclass(frozen=True)
+class Case:
+    """Three flights of a plant with one hidden effect or none."""
+
+    kind: str
+    effect: str
+    number: int
+    seed: int
+    baseline: bool
+    code: str
+    cost = 1
+
+    @property
+    def name(self):
+        """Of the case in tables."""
+        return f'{self.kind} {self.effect} {self.number}'
+
+    @property
+    def key(self):
+        """Of everything that decides its result."""
+        return digest(repr(self))
+
+
+def examined(case):
+    """What `gap --learn` finds of the flights of a case, and how true it is."""
+    began, base, name = process_time(), RobotParameters.load(), case.effect
+    rng = np.random.default_rng([case.seed, list(KINDS).index(case.kind), case.number])
+    if name == 'module_reaction':       # else the plant has modules
+        base = replace(base, multibody=None)
+    CATALOGUE.update({each: family(each) for each in KINDS['outside']})     # no fit has them
+    row = {'case': case.name, 'kind': case.kind, 'controller': ('nmpc', 'rl')[case.number % 2],
+           'truth': {} if name == UNDISTURBED else {name: drawn(name, base, rng)}}
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            row |= compared(row, base, Path(folder), rng, case)
+    except Exception as error:      # of one case; the others continue
+        row['failure'] = f'{type(error).__name__}: {error}'
+    return row | {'cpu_s': round(process_time() - began, 1)}
+
+
+def compared(row, base, folder, rng, case):
+    """Answers about three flights of the plant of a case, and their correlations."""
+    plant, bags = replace(base, effects=row['truth']), [folder / f'flight{i}' for i in range(3)]
+    *_, flown = (fly(row['controller'], base, plant, int(rng.integers(2**31)), bag)
+                 for bag in bags)
+    robot, without, corrected = (folder / f'{each}.yaml' for each in ('own', 'less', 'corrected'))
+    robot.write_text('extends: robot.yaml\n' + 'multibody: null\n' * (base.multibody is None))
+    without.write_text(f"without: [{case.effect * (case.kind == 'left_out')}]\n")
+    result = gap_results(bags[:2], bags[2:], robot, corrected, console=Console(quiet=True),
+                         parameters=without, learn=folder / 'effect.yaml')
+    laws = {'': {}, '_baseline': sparse(bags[:2], base) if case.baseline else {}}
+    for effect in result['effects']:
+        if 'expressions' in effect:
+            laws[''] = {term: k['value'] for term, k in effect['parameters'].items()}
+    answers = {which: with_formula(base, law) for which, law in laws.items()} | {
+        '_all': RobotParameters.load(corrected) if result['effects'] else base}
+    before = wrench(base, base, flown(base))
+    true = wrench(plant, base, flown()) - before
+    return {'verdict': result['verdict'], 'closure': result['closure'], **{
+        key: result['formula'].get(key) for key in ('reason', 'ln_bayes_factor')},
+        'named': [label(each) for each in result['effects'] if 'expressions' not in each],
+        **{f'formula{which}': law for which, law in laws.items()},
+        **{f'correlation{which}': correlation(true, wrench(other, base, flown(other)) - before)
+           for which, other in answers.items()},
+        'force_N': float(np.sqrt((true**2).sum(axis=1).mean()))}
+
+
+def line(case, row, kept=False):
+    """A row of the table."""
+    if 'failure' in row:
+        return f'{case.name:42} {row["failure"]}'
+    law = ' + '.join(f'{k:.3g} {term}' for term, k in row['formula'].items()) or row['reason']
+    return f"{case.name:42} {row['controller']:4} " + ' '.join(
+        '     -' if each is None else f'{each:6.3g}' for each in (
+            row['force_N'], *(row[f'correlation{each}'] for each in ('', '_all', '_baseline')),
+            row['closure'], row['ln_bayes_factor'])) + (
+        f" {', '.join(row['named']) or '-'} | {law} | baseline {len(row['formula_baseline'])}")
+
+
+def summary(rows):
+    """Counts of one kind of cases."""
+    own = [row for row in rows if 'failure' not in row]
+    laws = [row for row in own if row['formula']]
+    return {'cases': len(rows), 'failures': len(rows) - len(own), 'formulas': len(laws),
+            **{f'rediscovered{which}': sum(bool(
+                row[f'correlation{which}'] >= LIKE and row['closure'] >= CLOSED)
+                for row in laws) for which in ('', '_all')},
+            'named_without_formula': sum(bool(row['named']) for row in own if row not in laws),
+            'baseline_formulas': sum(bool(row['formula_baseline']) for row in own),
+            'baseline_correlated': sum(row['correlation_baseline'] >= LIKE for row in own)}
+
+
+def main():
+    """Run the cases that are missing and print what all of them show."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--only', choices=KINDS, help='one kind of cases')
+    parser.add_argument('--cases', type=int, help='of each kind (each effect, 50 undisturbed)')
+    parser.add_argument('--jobs', type=int, help='at a time (every core)')
+    parser.add_argument('--baseline', action='store_true', help='also plain sparse regression')
+    parser.add_argument('--out', type=Path, default=Path('runs_out/formulas.json'),
+                        help='results; finished cases are kept in a folder beside it')
+    given = parser.parse_args()
+    if given.baseline and importlib.util.find_spec('pysindy') is None:
+        parser.error('--baseline: expected the package pysindy, found none')
+    code = digest(*(path.read_bytes() for path in (
+        Path(__file__), *sorted(SOURCE.rglob('*.py')))))
+    cases = [(Case(kind, names[k % len(names)], k, given.seed, given.baseline, code),)
+             for kind, names in KINDS.items() if given.only in (None, kind)
+             for k in range(given.cases or (50 if kind == UNDISTURBED else len(names)))]
+    console = Console(width=250)
+    console.print(f'{"case":42} by    force [N], correlation of the formula, of all, of the '
+                  'baseline, closure, ln B, named | formula')
+    rows = sweep(examined, cases, store=Store(given.out.with_suffix('')), jobs=given.jobs,
+                 console=console, line=line)
+    counts = {kind: summary(own) for kind in KINDS if (
+        own := [row for row in rows if row['kind'] == kind])}
+    given.out.write_text(json.dumps({'seed': given.seed, 'summary': counts, 'cases': rows},
+                                    indent=1))
+    console.print_json(json.dumps(counts))
+
+
+if __name__ == '__main__':
+    main()
