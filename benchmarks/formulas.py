@@ -10,7 +10,9 @@ the same terms (pysindy). The same command continues an interrupted run.
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
+from collections import namedtuple
+from contextlib import closing
+from dataclasses import replace
 import importlib.util
 import json
 from pathlib import Path
@@ -39,15 +41,15 @@ from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.formula import library, SHARE, size_of
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.terms import Effect, EffectParameter
-from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 LIKE, CLOSED = 0.95, 0.8    # least correlation and closure of a law that is rediscovered
 LOW = 0.3                   # [m] the flight above counts
-UNDISTURBED = 'undisturbed'
+UNDISTURBED, TRIES = 'undisturbed', 5   # draws of an effect until no flight is lost
 WIDTHS = {'position': 3, 'velocity': 3, 'quaternion': 4, 'angular_velocity': 3, 'tilt': 4,
           'tilt_rate': 4, 'thrust': 4, 'voltage_ratio': 1, 'tilt_acceleration': 4,
           'thrust_rate': 4}
 X, Y, Z = (ca.DM(row) for row in np.eye(3))
+Case = namedtuple('Case', 'name key cost kind effect number seed baseline')
 
 
 def near(t, i, way, place):
@@ -109,60 +111,58 @@ KINDS = {'left_out': [name for name, entry in CATALOGUE.items() if name in TREAT
 
 def drawn(name, robot, rng):
     """Parameters of an effect of 1 to 2 typical sizes, of a random sign or direction."""
-    factor = rng.uniform(1, 2)
+    factor, entry, made = rng.uniform(1, 2), CATALOGUE[name], {}
     if name in KINDS['outside']:
         return {'size': factor * (FORCES | GAINS)[name][0]}
     keys = [key for key in all_keys(robot).values() if key.effect == name and not key.form]
-    way = rng.normal(size=len(keys)) if keys[-1].index else rng.choice([-1.0, 1.0]) * np.ones(
-        len(keys))
-    way /= np.linalg.norm(way) if keys[-1].index else 1.0
-    if CATALOGUE[name].each:        # of one rotor
-        way = np.sign(way) * (np.arange(len(keys)) == rng.integers(len(keys)))
-    if CATALOGUE[name].delays or name in LIMITS:
-        way = np.array([1.0 if CATALOGUE[name].delays else -1.0])
-    made = {}
+    way = rng.normal(size=len(keys))
+    if entry.each:      # one rotor
+        way *= np.arange(len(keys)) == rng.integers(len(keys))
+    way = way / np.linalg.norm(way) if keys[-1].index else np.sign(way[:1]).repeat(len(keys))
+    if entry.delays or name in LIMITS:
+        way = -np.ones(1) if name in LIMITS else np.ones(1)
     for key, part in zip(keys, way, strict=True):
-        spec, more = CATALOGUE[name].parameters[key.parameter], factor * part * key.typical
-        made.setdefault(key.parameter, []).append(key.value(
-            more if spec.low <= key.value(more) <= spec.high else -more))
+        spec, more = entry.parameters[key.parameter], factor * part * key.typical
+        made.setdefault(key.parameter, []).append(float(key.value(
+            more if spec.low <= key.value(more) <= spec.high else -more)))
     return {key: tuple(each) if len(each) > 1 else each[0] for key, each in made.items()}
 
 
 def fly(controller, robot, plant, seed, bag):
-    """True states at 200 Hz above LOW, name -> (N, width), and the thrusts of other robots."""
+    """True states at 200 Hz above LOW, and those with the thrusts of another robot; None: lost."""
     loop, rows = prepared(controller, robot=robot, plant=plant, seed=seed, bag=bag), []
+    simulator = loop.simulator
 
     def note():
-        true = loop.simulator.truth
+        true, battery = simulator.truth, simulator.battery
         rows.append(np.hstack([
             true.position, true.velocity, true.quaternion, true.angular_velocity, true.tilt,
             true.tilt_velocity, true.thrust / plant.thrust_scale,
-            loop.simulator.battery.voltage / plant.battery.full_voltage, true.stamp]))
+            battery.voltage / plant.battery.full_voltage, true.stamp, battery.thrust_limit]))
     loop.before_messages = note
-    try:
+    with closing(loop):
         if not loop.fly(make_task('random5', seed)):
-            raise RuntimeError('the flight is lost')
+            return None
         command = loop.recording().command
-    finally:
-        loop.close()
-    *states, t = np.split(np.array(rows), np.cumsum(list(WIDTHS.values())[:8]), axis=1)
-    made = dict(zip(WIDTHS, states, strict=False))
-    step, t = loop.simulator.tick, t[:, 0]
-    made |= {'tilt_acceleration': np.gradient(made['tilt_rate'], step, axis=0),
-             'thrust_rate': np.gradient(made['thrust'], step, axis=0)}
-    high = made['position'][:, 2] > LOW
+    *states, rest = np.split(np.array(rows), np.cumsum(list(WIDTHS.values())[:8]), axis=1)
+    made, step, (t, most) = dict(zip(WIDTHS, states, strict=False)), simulator.tick, rest.T
+    made |= {name: np.gradient(made[of], step, axis=0) for name, of in (
+        ('tilt_acceleration', 'tilt_rate'), ('thrust_rate', 'thrust'))}
 
     def flown(other=None):
-        """The states, with the thrusts with which another robot answers the same commands."""
-        if other is None:
-            return {name: values[high] for name, values in made.items()}
-        late = SimulatorParameters.load().command_delay + other.command_delays[1]
-        at = np.clip(np.searchsorted(command.t + late, t - 1e-6, side='right') - 1, 0, None)
-        aim = np.clip(command.thrust[at], other.rotors.thrust_min, other.rotors.thrust_max)
-        gain = -np.expm1(-step / other.rotors.time_constant)
-        thrust = lfilter([0, gain], [1, gain - 1], aim, axis=0)
-        return flown() | {'thrust': thrust[high], 'thrust_rate': (
-            (aim - thrust) / other.rotors.time_constant)[high]}
+        """States, name -> (N, width); the thrusts are answers to the recorded commands."""
+        more = {}
+        if other:
+            late, rotors = GapParameters.load().command_delay + other.command_delays[1], \
+                other.rotors
+            at = np.searchsorted(command.t + late, t + 1e-5, side='right') - 1
+            aim = np.clip(command.thrust[np.maximum(at, 0)], rotors.thrust_min, np.minimum(
+                rotors.thrust_max, most)[:, None])
+            gain = -np.expm1(-step / rotors.time_constant)
+            thrust = lfilter([0, gain], [1, gain - 1], aim, axis=0)
+            more = {'thrust': thrust, 'thrust_rate': (aim - thrust) / rotors.time_constant}
+        return {name: values[made['position'][:, 2] > LOW] for name, values in (
+            made | more).items()}
     return flown
 
 
@@ -209,51 +209,32 @@ def sparse(bags, robot):
     return {term: float(k) for term, k in zip(terms, found, strict=True) if k}
 
 
-@dataclass(frozen=True)
-class Case:
-    """Three flights of a plant with one hidden effect or none."""
-
-    kind: str
-    effect: str
-    number: int
-    seed: int
-    baseline: bool
-    code: str
-    cost = 1
-
-    @property
-    def name(self):
-        """Of the case in tables."""
-        return f'{self.kind} {self.effect} {self.number}'
-
-    @property
-    def key(self):
-        """Of everything that decides its result."""
-        return digest(repr(self))
-
-
 def examined(case):
     """What `gap --learn` finds of the flights of a case, and how true it is."""
-    began, base, name = process_time(), RobotParameters.load(), case.effect
-    rng = np.random.default_rng([case.seed, list(KINDS).index(case.kind), case.number])
-    if name == 'module_reaction':       # else the plant has modules
+    began, base = process_time(), RobotParameters.load()
+    if case.effect == 'module_reaction':    # else the plant has modules
         base = replace(base, multibody=None)
-    CATALOGUE.update({each: family(each) for each in KINDS['outside']})     # no fit has them
-    row = {'case': case.name, 'kind': case.kind, 'controller': ('nmpc', 'rl')[case.number % 2],
-           'truth': {} if name == UNDISTURBED else {name: drawn(name, base, rng)}}
+    CATALOGUE.update({name: family(name) for name in KINDS['outside']})     # no fit has them
+    row = {'case': case.name, 'kind': case.kind, 'controller': ('nmpc', 'rl')[case.number % 2]}
     try:
         with tempfile.TemporaryDirectory() as folder:
-            row |= compared(row, base, Path(folder), rng, case)
+            row |= compared(case, row['controller'], base, Path(folder))
     except Exception as error:      # of one case; the others continue
         row['failure'] = f'{type(error).__name__}: {error}'
     return row | {'cpu_s': round(process_time() - began, 1)}
 
 
-def compared(row, base, folder, rng, case):
-    """Answers about three flights of the plant of a case, and their correlations."""
-    plant, bags = replace(base, effects=row['truth']), [folder / f'flight{i}' for i in range(3)]
-    *_, flown = (fly(row['controller'], base, plant, int(rng.integers(2**31)), bag)
-                 for bag in bags)
+def compared(case, controller, base, folder):
+    """Answers about three flights of a plant, and their correlations with the true force."""
+    rng = np.random.default_rng([case.seed, list(KINDS).index(case.kind), case.number])
+    for lost in range(TRIES):
+        truth = {} if case.kind == UNDISTURBED else {case.effect: drawn(case.effect, base, rng)}
+        plant, bags = replace(base, effects=truth), [folder / f'{lost}_{i}' for i in range(3)]
+        if all(flown := fly(controller, base, plant, int(rng.integers(2**31)), bag)
+               for bag in bags):
+            break
+    else:
+        raise RuntimeError(f'{TRIES} flights are lost')
     robot, without, corrected = (folder / f'{each}.yaml' for each in ('own', 'less', 'corrected'))
     robot.write_text('extends: robot.yaml\n' + 'multibody: null\n' * (base.multibody is None))
     without.write_text(f"without: [{case.effect * (case.kind == 'left_out')}]\n")
@@ -267,13 +248,13 @@ def compared(row, base, folder, rng, case):
         '_all': RobotParameters.load(corrected) if result['effects'] else base}
     before = wrench(base, base, flown(base))
     true = wrench(plant, base, flown()) - before
-    return {'verdict': result['verdict'], 'closure': result['closure'], **{
-        key: result['formula'].get(key) for key in ('reason', 'ln_bayes_factor')},
-        'named': [label(each) for each in result['effects'] if 'expressions' not in each],
-        **{f'formula{which}': law for which, law in laws.items()},
-        **{f'correlation{which}': correlation(true, wrench(other, base, flown(other)) - before)
-           for which, other in answers.items()},
-        'force_N': float(np.sqrt((true**2).sum(axis=1).mean()))}
+    return {'truth': truth, 'lost': lost, 'force_N': float(np.sqrt((true**2).sum(1).mean())),
+            'named': [label(each) for each in result['effects'] if 'expressions' not in each],
+            **{key: result[key] for key in ('verdict', 'closure')},
+            **{key: result['formula'].get(key) for key in ('reason', 'ln_bayes_factor')},
+            **{f'formula{which}': law for which, law in laws.items()},
+            **{f'correlation{which}': correlation(true, wrench(
+                other, base, flown(other)) - before) for which, other in answers.items()}}
 
 
 def line(case, row, kept=False):
@@ -316,13 +297,15 @@ def main():
         parser.error('--baseline: expected the package pysindy, found none')
     code = digest(*(path.read_bytes() for path in (
         Path(__file__), *sorted(SOURCE.rglob('*.py')))))
-    cases = [(Case(kind, names[k % len(names)], k, given.seed, given.baseline, code),)
+    cases = [(kind, names[k % len(names)], k, given.seed, given.baseline)
              for kind, names in KINDS.items() if given.only in (None, kind)
              for k in range(given.cases or (50 if kind == UNDISTURBED else len(names)))]
+    calls = [(Case(' '.join(map(str, case[:3])), digest(code, repr(case)), 1, *case),)
+             for case in cases]
     console = Console(width=250)
     console.print(f'{"case":42} by    force [N], correlation of the formula, of all, of the '
                   'baseline, closure, ln B, named | formula')
-    rows = sweep(examined, cases, store=Store(given.out.with_suffix('')), jobs=given.jobs,
+    rows = sweep(examined, calls, store=Store(given.out.with_suffix('')), jobs=given.jobs,
                  console=console, line=line)
     counts = {kind: summary(own) for kind in KINDS if (
         own := [row for row in rows if row['kind'] == kind])}
