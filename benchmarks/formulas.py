@@ -27,23 +27,16 @@ from scipy.signal import lfilter
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.campaign import digest, SOURCE, Store, sweep
 from beetle_omni_ros.flight.evaluate import prepared
-from beetle_omni_ros.identify.flights.bag_flight import BagFlight
-from beetle_omni_ros.identify.flights.body import BodyModel, tilting_modules
-from beetle_omni_ros.identify.flights.command import gap_results
+from beetle_omni_ros.identify.flights import bag_flight, body, command, page, treatment
 from beetle_omni_ros.identify.flights.keys import all_keys, ARM, extra_keys, LIMITS
-from beetle_omni_ros.identify.flights.page import label
-from beetle_omni_ros.identify.flights.treatment import TREATMENTS
-from beetle_omni_ros.identify.recording.bag import read_recording
-from beetle_omni_ros.identify.recording.flight import prepare
-from beetle_omni_ros.identify.recording.parameters import GapParameters
-from beetle_omni_ros.model import dynamics
+from beetle_omni_ros.identify.recording import bag, flight, parameters
+from beetle_omni_ros.model import dynamics, formula, terms
 from beetle_omni_ros.model.effects import CATALOGUE
-from beetle_omni_ros.model.formula import library, SHARE, size_of
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.terms import Effect, EffectParameter
 
 LIKE, CLOSED = 0.95, 0.8    # least correlation and closure of a law that is rediscovered
 LOW = 0.3                   # [m] the flight above counts
+GAP = parameters.GapParameters.load()
 UNDISTURBED, TRIES = 'undisturbed', 5   # draws of an effect until no flight is lost
 WIDTHS = {'position': 3, 'velocity': 3, 'quaternion': 4, 'angular_velocity': 3, 'tilt': 4,
           'tilt_rate': 4, 'thrust': 4, 'voltage_ratio': 1, 'tilt_acceleration': 4,
@@ -79,8 +72,8 @@ FORCES = {
     # a fan blows along x, Gaussian with a deviation of 0.5 m
     'jet': (1.0, lambda t, k: k * X * ca.exp(-2 * ca.sumsqr(
         t.position[1:] - ca.DM([0.3, 1.2])))),
-    # rotors draw the air from between themselves and a wall at y = 2 m
-    'wall': (0.6, lambda t, k: k * Y * sum(t.thrust[i] * near(t, i, Y, 2.0) for i in range(4)))}
+    # rotors draw the air from between themselves and a wall at y = 2.5 m
+    'wall': (0.6, lambda t, k: k * Y * sum(t.thrust[i] * near(t, i, Y, 2.5) for i in range(4)))}
 # Name -> least size, and the factor of the thrust of rotor i.
 GAINS = {
     # as near the ground, of 2.6 m height
@@ -101,10 +94,10 @@ def family(name):
             t.force_world = t.force_world + FORCES[name][1](t, size)
         else:
             t.thrust = t.thrust * ca.vertcat(*(GAINS[name][1](t, size, i) for i in range(4)))
-    return Effect('body', {'size': EffectParameter('SI', 0.0, 0.0, 10.0)}, name, apply)
+    return terms.Effect('body', {'size': terms.EffectParameter('SI', 0.0, 0.0, 10.0)}, name, apply)
 
 
-KINDS = {'left_out': [name for name, entry in CATALOGUE.items() if name in TREATMENTS
+KINDS = {'left_out': [name for name, entry in CATALOGUE.items() if name in treatment.TREATMENTS
                       and entry.layer in ('body', 'rotor') and entry.each != 'term'],
          'outside': [*FORCES, *GAINS], UNDISTURBED: [UNDISTURBED]}
 
@@ -128,9 +121,9 @@ def drawn(name, robot, rng):
     return {key: tuple(each) if len(each) > 1 else each[0] for key, each in made.items()}
 
 
-def fly(controller, robot, plant, seed, bag):
+def fly(controller, robot, plant, seed, path):
     """True states at 200 Hz above LOW, and those with the thrusts of another robot; None: lost."""
-    loop, rows = prepared(controller, robot=robot, plant=plant, seed=seed, bag=bag), []
+    loop, rows = prepared(controller, robot=robot, plant=plant, seed=seed, bag=path), []
     simulator = loop.simulator
 
     def note():
@@ -143,7 +136,7 @@ def fly(controller, robot, plant, seed, bag):
     with closing(loop):
         if not loop.fly(make_task('random5', seed)):
             return None
-        command = loop.recording().command
+        sent = loop.recording().command
     *states, rest = np.split(np.array(rows), np.cumsum(list(WIDTHS.values())[:8]), axis=1)
     made, step, (t, most) = dict(zip(WIDTHS, states, strict=False)), simulator.tick, rest.T
     made |= {name: np.gradient(made[of], step, axis=0) for name, of in (
@@ -153,10 +146,10 @@ def fly(controller, robot, plant, seed, bag):
         """States, name -> (N, width); the thrusts are answers to the recorded commands."""
         more = {}
         if other:
-            late, rotors = GapParameters.load().command_delay + other.command_delays[1], \
-                other.rotors
-            at = np.searchsorted(command.t + late, t + 1e-5, side='right') - 1
-            aim = np.clip(command.thrust[np.maximum(at, 0)], rotors.thrust_min, np.minimum(
+            rotors = other.rotors
+            late = GAP.command_delay + other.command_delays[1]
+            at = np.searchsorted(sent.t + late, t + 1e-5, side='right') - 1
+            aim = np.clip(sent.thrust[np.maximum(at, 0)], rotors.thrust_min, np.minimum(
                 rotors.thrust_max, most)[:, None])
             gain = -np.expm1(-step / rotors.time_constant)
             thrust = lfilter([0, gain], [1, gain - 1], aim, axis=0)
@@ -188,25 +181,25 @@ def with_formula(robot, found):
         'expressions': tuple(found), 'coefficients': tuple(found.values())}} if found else {})
 
 
-def sparse(bags, robot):
-    """Formula of two flights by sequentially thresholded least squares, as the library comes."""
+def sparse(paths, robot):
+    """Formula of flights by sequentially thresholded least squares, as the library comes."""
     from pysindy import STLSQ
-    terms, p, weight = library(), GapParameters.load(), robot.mass * robot.gravity
-    known = with_formula(robot, dict.fromkeys(terms, 0.0))
+    library, weight, x, y = formula.library(), robot.mass * robot.gravity, [], []
+    known = with_formula(robot, dict.fromkeys(library, 0.0))
     keys = {**all_keys(known), **extra_keys()}
-    body, sizes = BodyModel(known, keys, tilting_modules(robot)), np.array([
-        size_of(term, weight, ARM) for term in terms])
-    units = np.array([robot.mass] * 3 + list(robot.inertia / ARM)) / (SHARE * weight)
-    x, y = [], []
-    for bag in bags:
-        made = BagFlight(prepare(read_recording(bag), robot, p, False), known, body, keys, p)
+    model = body.BodyModel(known, keys, body.tilting_modules(robot))
+    sizes = np.array([formula.size_of(term, weight, ARM) for term in library])
+    units = np.array([robot.mass] * 3 + list(robot.inertia / ARM)) / (formula.SHARE * weight)
+    for path in paths:
+        own = flight.prepare(bag.read_recording(path), robot, GAP, False)
+        made = bag_flight.BagFlight(own, known, model, keys, GAP)
         made.modules = float(robot.multibody is not None)
-        linear = made.linear({}, [f'formula.coefficients[{k}]' for k in range(len(terms))])
-        y.append((units * linear.residual[:, :6])[made.mask[:, 0]].ravel())
-        x.append(-(units[:, None] * linear.slopes[:, :6] * sizes)[made.mask[:, 0]].reshape(
-            -1, len(terms)))
+        linear = made.linear({}, [f'formula.coefficients[{k}]' for k in range(len(library))])
+        use = made.mask[:, 0]
+        y.append((units * linear.residual[use, :6]).ravel())
+        x.append(-(units[:, None] * linear.slopes[use, :6] * sizes).reshape(-1, len(sizes)))
     found = STLSQ().fit(np.concatenate(x), np.concatenate(y)[:, None]).coef_.ravel() * sizes
-    return {term: float(k) for term, k in zip(terms, found, strict=True) if k}
+    return {term: float(k) for term, k in zip(library, found, strict=True) if k}
 
 
 def examined(case):
@@ -229,18 +222,18 @@ def compared(case, controller, base, folder):
     rng = np.random.default_rng([case.seed, list(KINDS).index(case.kind), case.number])
     for lost in range(TRIES):
         truth = {} if case.kind == UNDISTURBED else {case.effect: drawn(case.effect, base, rng)}
-        plant, bags = replace(base, effects=truth), [folder / f'{lost}_{i}' for i in range(3)]
-        if all(flown := fly(controller, base, plant, int(rng.integers(2**31)), bag)
-               for bag in bags):
+        plant, paths = replace(base, effects=truth), [folder / f'{lost}_{i}' for i in range(3)]
+        if all(flown := fly(controller, base, plant, int(rng.integers(2**31)), path)
+               for path in paths):
             break
     else:
         raise RuntimeError(f'{TRIES} flights are lost')
     robot, without, corrected = (folder / f'{each}.yaml' for each in ('own', 'less', 'corrected'))
     robot.write_text('extends: robot.yaml\n' + 'multibody: null\n' * (base.multibody is None))
     without.write_text(f"without: [{case.effect * (case.kind == 'left_out')}]\n")
-    result = gap_results(bags[:2], bags[2:], robot, corrected, console=Console(quiet=True),
-                         parameters=without, learn=folder / 'effect.yaml')
-    laws = {'': {}, '_baseline': sparse(bags[:2], base) if case.baseline else {}}
+    result = command.gap_results(paths[:2], paths[2:], robot, corrected, parameters=without,
+                                 learn=folder / 'effect.yaml', console=Console(quiet=True))
+    laws = {'': {}, '_baseline': sparse(paths[:2], base) if case.baseline else {}}
     for effect in result['effects']:
         if 'expressions' in effect:
             laws[''] = {term: k['value'] for term, k in effect['parameters'].items()}
@@ -249,7 +242,7 @@ def compared(case, controller, base, folder):
     before = wrench(base, base, flown(base))
     true = wrench(plant, base, flown()) - before
     return {'truth': truth, 'lost': lost, 'force_N': float(np.sqrt((true**2).sum(1).mean())),
-            'named': [label(each) for each in result['effects'] if 'expressions' not in each],
+            'named': [page.label(each) for each in result['effects'] if 'expressions' not in each],
             **{key: result[key] for key in ('verdict', 'closure')},
             **{key: result['formula'].get(key) for key in ('reason', 'ln_bayes_factor')},
             **{f'formula{which}': law for which, law in laws.items()},
