@@ -30,8 +30,7 @@ from beetle_omni_ros.flight.evaluate import prepared
 from beetle_omni_ros.identify.flights import bag_flight, body, command, page, treatment
 from beetle_omni_ros.identify.flights.keys import all_keys, ARM, extra_keys, LIMITS
 from beetle_omni_ros.identify.recording import bag, flight, parameters
-from beetle_omni_ros.model import dynamics, formula, terms
-from beetle_omni_ros.model.effects import CATALOGUE
+from beetle_omni_ros.model import dynamics, effects, formula, terms
 from beetle_omni_ros.model.parameters import RobotParameters
 
 LIKE, CLOSED = 0.95, 0.8    # least correlation and closure of a law that is rediscovered
@@ -97,14 +96,15 @@ def family(name):
     return terms.Effect('body', {'size': terms.EffectParameter('SI', 0.0, 0.0, 10.0)}, name, apply)
 
 
-KINDS = {'left_out': [name for name, entry in CATALOGUE.items() if name in treatment.TREATMENTS
-                      and entry.layer in ('body', 'rotor') and entry.each != 'term'],
-         'outside': [*FORCES, *GAINS], UNDISTURBED: [UNDISTURBED]}
+KINDS = {'left_out': [
+    name for name, entry in effects.CATALOGUE.items() if name in treatment.TREATMENTS
+    and entry.layer in ('body', 'rotor') and entry.each != 'term'],
+    'outside': [*FORCES, *GAINS], UNDISTURBED: [UNDISTURBED]}
 
 
 def drawn(name, robot, rng):
     """Parameters of an effect of 1 to 2 typical sizes, of a random sign or direction."""
-    factor, entry, made = rng.uniform(1, 2), CATALOGUE[name], {}
+    factor, entry, made = rng.uniform(1, 2), effects.CATALOGUE[name], {}
     if name in KINDS['outside']:
         return {'size': factor * (FORCES | GAINS)[name][0]}
     keys = [key for key in all_keys(robot).values() if key.effect == name and not key.form]
@@ -207,7 +207,8 @@ def examined(case):
     began, base = process_time(), RobotParameters.load()
     if case.effect == 'module_reaction':    # else the plant has modules
         base = replace(base, multibody=None)
-    CATALOGUE.update({name: family(name) for name in KINDS['outside']})     # no fit has them
+    # by the module, of which a worker has no copy; without a treatment no fit searches them
+    effects.CATALOGUE.update({name: family(name) for name in KINDS['outside']})
     row = {'case': case.name, 'kind': case.kind, 'controller': ('nmpc', 'rl')[case.number % 2]}
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -255,11 +256,14 @@ def line(case, row, kept=False):
     if 'failure' in row:
         return f'{case.name:42} {row["failure"]}'
     law = ' + '.join(f'{k:.3g} {term}' for term, k in row['formula'].items()) or row['reason']
+    numbers = [row[key] for key in ('force_N', 'correlation', 'correlation_all', 'closure',
+                                    'ln_bayes_factor')]
+    if case.baseline:
+        law += f" | baseline {row['correlation_baseline']:.3g}, " \
+            f"{len(row['formula_baseline'])} terms"
     return f"{case.name:42} {row['controller']:4} " + ' '.join(
-        '     -' if each is None else f'{each:6.3g}' for each in (
-            row['force_N'], *(row[f'correlation{each}'] for each in ('', '_all', '_baseline')),
-            row['closure'], row['ln_bayes_factor'])) + (
-        f" {', '.join(row['named']) or '-'} | {law} | baseline {len(row['formula_baseline'])}")
+        '     -' if each is None else f'{each:6.3g}' for each in numbers) + (
+        f" {', '.join(row['named']) or '-'} | {law}")
 
 
 def summary(rows):
@@ -296,8 +300,8 @@ def main():
     calls = [(Case(' '.join(map(str, case[:3])), digest(code, repr(case)), 1, *case),)
              for case in cases]
     console = Console(width=250)
-    console.print(f'{"case":42} by    force [N], correlation of the formula, of all, of the '
-                  'baseline, closure, ln B, named | formula')
+    console.print(f'{"case":42} by    force [N], correlation of the formula, with the entries '
+                  'named beside it, closure, ln B, these entries | formula')
     rows = sweep(examined, calls, store=Store(given.out.with_suffix('')), jobs=given.jobs,
                  console=console, line=line)
     counts = {kind: summary(own) for kind in KINDS if (
