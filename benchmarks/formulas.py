@@ -207,7 +207,7 @@ def examined(case):
     began, base = process_time(), RobotParameters.load()
     if case.effect == 'module_reaction':    # else the plant has modules
         base = replace(base, multibody=None)
-    # by the module, of which a worker has no copy; without a treatment no fit searches them
+    # Of the module, because a worker has a copy of globals. Without a treatment no fit has them.
     effects.CATALOGUE.update({name: family(name) for name in KINDS['outside']})
     row = {'case': case.name, 'kind': case.kind, 'controller': ('nmpc', 'rl')[case.number % 2]}
     try:
@@ -245,6 +245,7 @@ def compared(case, controller, base, folder):
     return {'truth': truth, 'lost': lost, 'force_N': float(np.sqrt((true**2).sum(1).mean())),
             'named': [page.label(each) for each in result['effects'] if 'expressions' not in each],
             **{key: result[key] for key in ('verdict', 'closure')},
+            'closure_of_formula': result['formula'].get('closure'),
             **{key: result['formula'].get(key) for key in ('reason', 'ln_bayes_factor')},
             **{f'formula{which}': law for which, law in laws.items()},
             **{f'correlation{which}': correlation(true, wrench(
