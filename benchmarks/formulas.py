@@ -127,18 +127,20 @@ def fly(controller, robot, plant, seed, path):
     simulator = loop.simulator
 
     def note():
-        true, battery = simulator.truth, simulator.battery
+        true = simulator.truth
         rows.append(np.hstack([
             true.position, true.velocity, true.quaternion, true.angular_velocity, true.tilt,
             true.tilt_velocity, true.thrust / plant.thrust_scale,
-            battery.voltage / plant.battery.full_voltage, true.stamp, battery.thrust_limit]))
+            simulator.battery.voltage / plant.battery.full_voltage, true.stamp]))
     loop.before_messages = note
     with closing(loop):
         if not loop.fly(make_task('random5', seed)):
             return None
         sent = loop.recording().command
-    *states, rest = np.split(np.array(rows), np.cumsum(list(WIDTHS.values())[:8]), axis=1)
-    made, step, (t, most) = dict(zip(WIDTHS, states, strict=False)), simulator.tick, rest.T
+    *states, t = np.split(np.array(rows), np.cumsum(list(WIDTHS.values())[:8]), axis=1)
+    made, step, t = dict(zip(WIDTHS, states, strict=False)), simulator.tick, t[:, 0]
+    rows = sorted((row.voltage, row.thrust_max) for row in robot.rotors.map)
+    most = np.interp(made['voltage_ratio'] * robot.battery.full_voltage, *zip(*rows, strict=True))
     made |= {name: np.gradient(made[of], step, axis=0) for name, of in (
         ('tilt_acceleration', 'tilt_rate'), ('thrust_rate', 'thrust'))}
 
@@ -150,7 +152,7 @@ def fly(controller, robot, plant, seed, path):
             late = GAP.command_delay + other.command_delays[1]
             at = np.searchsorted(sent.t + late, t + 1e-5, side='right') - 1
             aim = np.clip(sent.thrust[np.maximum(at, 0)], rotors.thrust_min, np.minimum(
-                rotors.thrust_max, most)[:, None])
+                rotors.thrust_max, most))
             gain = -np.expm1(-step / rotors.time_constant)
             thrust = lfilter([0, gain], [1, gain - 1], aim, axis=0)
             more = {'thrust': thrust, 'thrust_rate': (aim - thrust) / rotors.time_constant}
