@@ -26,9 +26,7 @@ import torch
 
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
-from beetle_omni_ros.train.batch import PERIOD
-from beetle_omni_ros.train.environment import SUBSTEPS, TiltableQuadrotorEnv
-from beetle_omni_ros.train.model import Physics
+from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.runner import choose_device, Runner
 
@@ -55,21 +53,6 @@ def with_robots(robots: int) -> TrainParameters:
     """Shipped parameters with another number of robots."""
     parameters = TrainParameters.load()
     return replace(parameters, ppo=replace(parameters.ppo, robots=robots))
-
-
-def agreement(device: str) -> float | None:
-    """Largest relative difference of kernel and torch after a period; None without kernel."""
-    p = with_robots(1000)
-    physics = Physics(ROBOT, PERIOD, SUBSTEPS, device)
-    if not physics.has_kernel:
-        return None
-    torch.manual_seed(0)
-    s = TiltableQuadrotorEnv(p, ROBOT, device, compiled=False).state
-    commands = [torch.cat((torch.rand(1000, 4, device=device) * 8 - 4,
-                           torch.rand(1000, 4, device=device) * 20), -1) for _ in range(3)]
-    given = s['x'], commands, s['delays'][:, :2], s['wrench'], s['body']
-    ours, theirs = physics.advance(*given), physics.advance_torch(*given)
-    return float(((ours - theirs).abs() / theirs.abs().clamp(min=1)).max())
 
 
 def environment_rate(robots: int, device: str) -> float:
@@ -128,9 +111,6 @@ def rsl_rls(robots: int, device: str) -> dict[str, float]:
 def show(results: dict, console: Console) -> None:
     """Print what was measured."""
     console.print(f"{results['device']}, torch {results['torch']}")
-    difference = results['kernel_difference']
-    console.print('kernel: ' + ('none on this device' if difference is None else
-                                f'agrees with torch to {difference:.1e} (relative)'))
     for robots, rate in results['environment'].items():
         console.print(f'environment, {robots} robots: {rate / 1e6:.3g} million steps/s')
     table = Table(title=f"one iteration, {results['robots']} robots x {results['steps']} steps "
@@ -167,7 +147,6 @@ def main():
     robots = ppo.robots if gpu else CPU_PPO_ROBOTS
     results = {'device': torch.cuda.get_device_name(device) if gpu else 'CPU, one thread',
                'torch': torch.__version__,
-               'kernel_difference': agreement(device),
                'environment': {size: environment_rate(size, device) for size in sizes},
                'robots': robots, 'steps': ppo.steps, 'ours': ours(robots, device),
                'rsl_rl': rsl_rls(robots, device)}

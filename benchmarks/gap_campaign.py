@@ -23,12 +23,12 @@ HERE = Path(__file__).resolve().parent
 PLACES = [str(HERE), str(HERE.parent)]
 sys.path[:0] = PLACES       # this tree's package, whatever is installed
 
-from gap_data.campaign import code_key, run_campaign  # noqa: E402
+from gap_data.campaign import run_campaign  # noqa: E402
 from gap_data.cases import DIFFICULTIES, KINDS, load_settings, make_cases  # noqa: E402
 from gap_data.effects import CATALOGUE, OUTSIDE  # noqa: E402
 from gap_data.score import markdown, score  # noqa: E402
 
-from beetle_omni_ros.flight.campaign import workers  # noqa: E402
+from beetle_omni_ros.flight.campaign import digest, SOURCE, workers  # noqa: E402
 
 TOOL = f'{sys.executable} -m beetle_omni_ros'
 
@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
     os.environ['PYTHONPATH'] = os.pathsep.join(filter(None, [
         *PLACES, os.environ.get('PYTHONPATH', '')]))     # for the workers and the tool
     cases, folder = chosen(given), given.folder.resolve()
-    version = code_key(HERE.parent / 'beetle_omni_ros')
+    version = digest(*(path.read_bytes() for path in sorted(SOURCE.rglob('*.py'))))[:8]
     with Progress(console=Console(stderr=True)) as bars, workers(jobs=given.jobs):
         bar = bars.add_task('cases', total=len(cases))
         judged = run_campaign(cases, '' if given.flights_only else given.tool, folder,

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 import json
 from pathlib import Path
 import sys
@@ -23,7 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from beetle_omni_ros.identify.flights.apply import effects_with
+from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.servo import compare as servo_compare
 from beetle_omni_ros.identify.servo.compare import compare, gap_of
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
@@ -137,18 +136,11 @@ def scored(made: dict, wanted: set) -> dict:
             'verdict': made['verdict']}
 
 
-def corrected(robot: RobotParameters, made: dict) -> RobotParameters:
-    """Robot as written by `--apply`."""
-    return replace(robot, effects={
-        name: {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
-        for name, values in effects_with(robot, made['effects']).items()})
-
-
 def own_correction(log: JointLog, robot: RobotParameters) -> dict:
     """Verdicts of a log against the shipped file, and against its correction by that."""
     found = identify([log], robot)
     first = gap_of(compare(log, robot), found, robot)
-    second = corrected(robot, first)
+    second = robot_with(robot, effects_with(robot, first['effects']))     # as --apply writes
     again = gap_of(compare(log, second), identify([log], second), second)
     return {'verdict': first['verdict'], 'names': [e['names'] for e in first['effects']],
             'reason': first['reason'], 'verdict_corrected': again['verdict'],

@@ -120,11 +120,3 @@ def read_answer(path: Path) -> tuple[dict | None, list[str]]:
                  for name, entry in effect['parameters'].items()
                  for key in ('value', 'unit', 'interval') if key not in entry]
     return answer, problems
-
-
-def code_key(root: Path) -> str:
-    """Of Python files below a folder: answers of other code are not the same answers."""
-    digest = hashlib.sha256()
-    for path in sorted(root.rglob('*.py')):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:8]

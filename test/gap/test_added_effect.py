@@ -69,6 +69,20 @@ def test_the_gap_finder_identifies_the_added_effect(name, values, value):
         f'{name}.{parameter}' for parameter in CATALOGUE[name].numbers}
 
 
+def test_an_effect_without_a_treatment_acts_as_the_file_has_it(monkeypatch):
+    def residual(loss):
+        robot = replace(ROBOT, effects={HEAT: {'loss_per_kelvin': loss, 'temperature': 50.0}}
+                        if loss else {})
+        keys = {**all_keys(robot), **extra_keys()}
+        return model(Motion(duration=10.0).flight(), robot, BodyModel(
+            robot, keys, (0.0, 0.0)), keys).residual({}, 'B')['B']
+    treated, none = residual(0.004), residual(0.0)
+    monkeypatch.delitem(TREATMENTS, HEAT)
+    assert f'{HEAT}.loss_per_kelvin' not in all_keys(ROBOT)
+    assert np.allclose(residual(0.004), treated) and np.allclose(residual(0.0), none)
+    assert np.abs(treated - none).max() > 0.01
+
+
 def test_a_flight_with_the_added_effect_names_it_with_its_size(tmp_path):
     hot = {HEAT: {'loss_per_kelvin': 0.004, 'temperature': 50.0}}
     beetle_omni_ros.simulate('hover', FIVE_POSES, seed=3, bag=tmp_path / 'flight', plant=replace(

@@ -39,8 +39,12 @@ class BodyModel:
         widths = WIDTHS | {f'state of {name}': 4 for name in self.slow}
         self._x = x = {name: ca.SX.sym(name, width) for name, width in widths.items()}
         effects: dict[str, dict] = {}
+        searched = {key.effect for key in keys.values()}
         for name, effect in CATALOGUE.items():
-            if effect.apply is None or effect.each == 'term' and name not in robot.effects:
+            if effect.apply is None:
+                continue
+            if name not in searched:    # without a treatment, it acts as the robot file has it
+                effects |= {name: robot.effects[name]} if name in robot.effects else {}
                 continue
             effects[name] = {parameter: robot.effects[name][parameter] if spec.text
                              else self._symbol(keys, name, parameter)

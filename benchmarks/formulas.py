@@ -1,0 +1,318 @@
+"""
+Formulas of `gap --learn` against hidden forces: ``python benchmarks/formulas.py --seed 0``.
+
+Each body and rotor entry is left out of the catalogue and hidden in three flights, and so are ten
+families outside it; undisturbed plants have no law. True force and formula follow from the true
+states of the third flight, which no fit has seen. ``--baseline`` adds plain sparse regression of
+the same terms (pysindy). The same command continues an interrupted run.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import namedtuple
+from contextlib import closing
+from dataclasses import replace
+import importlib.util
+import json
+from pathlib import Path
+import tempfile
+from time import process_time
+
+import casadi as ca
+import numpy as np
+from rich.console import Console
+from scipy.signal import lfilter
+
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.flight.campaign import digest, SOURCE, Store, sweep
+from beetle_omni_ros.flight.evaluate import prepared
+from beetle_omni_ros.identify.flights import bag_flight, body, command, page, treatment
+from beetle_omni_ros.identify.flights.keys import all_keys, ARM, extra_keys, LIMITS
+from beetle_omni_ros.identify.recording import bag, flight, parameters
+from beetle_omni_ros.model import dynamics, effects, formula, terms
+from beetle_omni_ros.model.parameters import RobotParameters
+
+LIKE, CLOSED = 0.95, 0.8    # least correlation and closure of a law that is rediscovered
+LOW = 0.3                   # [m] the flight above counts
+GAP = parameters.GapParameters.load()
+UNDISTURBED, TRIES = 'undisturbed', 5   # draws of an effect until no flight is lost
+WIDTHS = {'position': 3, 'velocity': 3, 'quaternion': 4, 'angular_velocity': 3, 'tilt': 4,
+          'tilt_rate': 4, 'thrust': 4, 'voltage_ratio': 1, 'tilt_acceleration': 4,
+          'thrust_rate': 4}
+X, Y, Z = (ca.DM(row) for row in np.eye(3))
+Case = namedtuple('Case', 'name key cost kind effect number seed baseline')
+
+
+def near(t, i, way, place):
+    """Inverse square of the distance of a rotor from a wall or ceiling, 1 at 0.25 m."""
+    return (0.25 / ca.fmax(place - ca.dot(way, t.position + t.rotation @ t.rotor_positions[i]),
+                           0.2))**2
+
+
+def beside(t, i, j):
+    """Cosine between the jet of rotor j and the way from there to rotor i; 0: it blows away."""
+    way = t.rotor_positions[i] - t.rotor_positions[j]
+    return ca.fmax(-ca.dot(way, t.thrust_directions[j]), 0) / ca.norm_2(way)
+
+
+# Name -> least size, and the force in world [N] of terms and size. All in SI units.
+FORCES = {
+    # elastic cord to a hook 3 m above the origin, slack below 1.2 m (Hooke)
+    'tether': (0.8, lambda t, k: k * (3 * Z - t.position) * ca.fmax(
+        1 - 1.2 / ca.norm_2(3 * Z - t.position), 0)),
+    # weight of the lifted part of a cable
+    'power_cable': (0.05, lambda t, k: -9.80665 * k * t.position[2] * Z),
+    # drag between the laws of Stokes and Newton
+    'power_drag': (0.6, lambda t, k: -k * t.velocity * ca.sumsqr(t.velocity)**0.25),
+    # pressure on a flat plate in the plane of the arms
+    'plate': (0.5, lambda t, k: -k * t.rotation[:, 2] * ca.dot(t.rotation[:, 2], t.velocity)
+              * ca.fabs(ca.dot(t.rotation[:, 2], t.velocity))),
+    # a fan blows along x, Gaussian with a deviation of 0.5 m
+    'jet': (1.0, lambda t, k: k * X * ca.exp(-2 * ca.sumsqr(
+        t.position[1:] - ca.DM([0.3, 1.2])))),
+    # rotors draw the air from between themselves and a wall at y = 2.5 m
+    'wall': (0.6, lambda t, k: k * Y * sum(t.thrust[i] * near(t, i, Y, 2.5) for i in range(4)))}
+# Name -> least size, and the factor of the thrust of rotor i.
+GAINS = {
+    # as near the ground, of 2.6 m height
+    'ceiling': (0.5, lambda t, k, i: 1 + k * near(t, i, Z, 2.6)),
+    # a tilted neighbour disturbs the inflow
+    'neighbour_tilt': (0.08, lambda t, k, i: 1 - k * ca.sin(t.tilt[(i + 1) % 4])**2),
+    # less thrust in the jets of the others
+    'wake': (0.1, lambda t, k, i: 1 - k * sum(
+        beside(t, i, j)**4 * t.thrust[j] / t.hover_thrust for j in range(4) if j != i)),
+    # blades twist under load
+    'twist': (0.1, lambda t, k, i: (ca.fmax(t.thrust[i], 0.01) / t.hover_thrust)**-k)}
+
+
+def family(name):
+    """Effect of a force or of factors of thrust, for the catalogue."""
+    def apply(t, size):
+        if name in FORCES:
+            t.force_world = t.force_world + FORCES[name][1](t, size)
+        else:
+            t.thrust = t.thrust * ca.vertcat(*(GAINS[name][1](t, size, i) for i in range(4)))
+    return terms.Effect('body', {'size': terms.EffectParameter('SI', 0.0, 0.0, 10.0)}, name, apply)
+
+
+KINDS = {'left_out': [
+    name for name, entry in effects.CATALOGUE.items() if name in treatment.TREATMENTS
+    and entry.layer in ('body', 'rotor') and entry.each != 'term'],
+    'outside': [*FORCES, *GAINS], UNDISTURBED: [UNDISTURBED]}
+
+
+def drawn(name, robot, rng):
+    """Parameters of an effect of 1 to 2 typical sizes, of a random sign or direction."""
+    factor, entry, made = rng.uniform(1, 2), effects.CATALOGUE[name], {}
+    if name in KINDS['outside']:
+        return {'size': factor * (FORCES | GAINS)[name][0]}
+    keys = [key for key in all_keys(robot).values() if key.effect == name and not key.form]
+    way = rng.normal(size=len(keys))
+    if entry.each:      # one rotor
+        way *= np.arange(len(keys)) == rng.integers(len(keys))
+    way = way / np.linalg.norm(way) if keys[-1].index else np.sign(way[:1]).repeat(len(keys))
+    if entry.delays or name in LIMITS:
+        way = -np.ones(1) if name in LIMITS else np.ones(1)
+    for key, part in zip(keys, way, strict=True):
+        spec, more = entry.parameters[key.parameter], factor * part * key.typical
+        made.setdefault(key.parameter, []).append(float(key.value(
+            more if spec.low <= key.value(more) <= spec.high else -more)))
+    return {key: tuple(each) if len(each) > 1 else each[0] for key, each in made.items()}
+
+
+def fly(controller, robot, plant, seed, path):
+    """True states at 200 Hz above LOW, and those with the thrusts of another robot; None: lost."""
+    loop, rows = prepared(controller, robot=robot, plant=plant, seed=seed, bag=path), []
+    simulator = loop.simulator
+
+    def note():
+        true = simulator.truth
+        rows.append(np.hstack([
+            true.position, true.velocity, true.quaternion, true.angular_velocity, true.tilt,
+            true.tilt_velocity, true.thrust / plant.thrust_scale,
+            simulator.battery.voltage / plant.battery.full_voltage, true.stamp]))
+    loop.before_messages = note
+    with closing(loop):
+        if not loop.fly(make_task('random5', seed)):
+            return None
+        sent = loop.recording().command
+    *states, t = np.split(np.array(rows), np.cumsum(list(WIDTHS.values())[:8]), axis=1)
+    made, step, t = dict(zip(WIDTHS, states, strict=False)), simulator.tick, t[:, 0]
+    rows = sorted((row.voltage, row.thrust_max) for row in robot.rotors.map)
+    most = np.interp(made['voltage_ratio'] * robot.battery.full_voltage, *zip(*rows, strict=True))
+    made |= {name: np.gradient(made[of], step, axis=0) for name, of in (
+        ('tilt_acceleration', 'tilt_rate'), ('thrust_rate', 'thrust'))}
+
+    def flown(other=None):
+        """States, name -> (N, width); the thrusts are answers to the recorded commands."""
+        more = {}
+        if other:
+            rotors = other.rotors
+            late = GAP.command_delay + other.command_delays[1]
+            at = np.searchsorted(sent.t + late, t + 1e-5, side='right') - 1
+            aim = np.clip(sent.thrust[np.maximum(at, 0)], rotors.thrust_min, np.minimum(
+                rotors.thrust_max, most))
+            gain = -np.expm1(-step / rotors.time_constant)
+            thrust = lfilter([0, gain], [1, gain - 1], aim, axis=0)
+            more = {'thrust': thrust, 'thrust_rate': (aim - thrust) / rotors.time_constant}
+        return {name: values[made['position'][:, 2] > LOW] for name, values in (
+            made | more).items()}
+    return flown
+
+
+def wrench(robot, base, states):
+    """(N, 6) force and torque over arm [N] in base_link of a robot file."""
+    x = {name: ca.SX.sym(name, width) for name, width in WIDTHS.items()}
+    acceleration, turning = dynamics.rigid_body(robot, **x)
+    made = ca.Function('wrench', list(x.values()), [ca.vertcat(
+        base.mass * dynamics.rotation_matrix(x['quaternion']).T @ acceleration,
+        ca.DM(base.inertia) * turning / ARM)])
+    return np.array(made.map(len(states['thrust']))(*(states[name].T for name in x))).T
+
+
+def correlation(true, found):
+    """Of two wrenches (N, 6), less the mean of each component."""
+    a, b = (each - each.mean(axis=0) for each in (true, found))
+    return float((a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-9))
+
+
+def with_formula(robot, found):
+    """The robot with a formula, term -> coefficient."""
+    return replace(robot, effects={'formula': {
+        'expressions': tuple(found), 'coefficients': tuple(found.values())}} if found else {})
+
+
+def sparse(paths, robot):
+    """Formula of flights by sequentially thresholded least squares, as the library comes."""
+    from pysindy import STLSQ
+    library, weight, x, y = formula.library(), robot.mass * robot.gravity, [], []
+    known = with_formula(robot, dict.fromkeys(library, 0.0))
+    keys = {**all_keys(known), **extra_keys()}
+    model = body.BodyModel(known, keys, body.tilting_modules(robot))
+    sizes = np.array([formula.size_of(term, weight, ARM) for term in library])
+    units = np.array([robot.mass] * 3 + list(robot.inertia / ARM)) / (formula.SHARE * weight)
+    for path in paths:
+        own = flight.prepare(bag.read_recording(path), robot, GAP, False)
+        made = bag_flight.BagFlight(own, known, model, keys, GAP)
+        made.modules = float(robot.multibody is not None)
+        linear = made.linear({}, [f'formula.coefficients[{k}]' for k in range(len(library))])
+        use = made.mask[:, 0]
+        y.append((units * linear.residual[use, :6]).ravel())
+        x.append(-(units[:, None] * linear.slopes[use, :6] * sizes).reshape(-1, len(sizes)))
+    found = STLSQ().fit(np.concatenate(x), np.concatenate(y)[:, None]).coef_.ravel() * sizes
+    return {term: float(k) for term, k in zip(library, found, strict=True) if k}
+
+
+def examined(case):
+    """What `gap --learn` finds of the flights of a case, and how true it is."""
+    began, base = process_time(), RobotParameters.load()
+    if case.effect == 'module_reaction':    # else the plant has modules
+        base = replace(base, multibody=None)
+    # Of the module, because a worker has a copy of globals. Without a treatment no fit has them.
+    effects.CATALOGUE.update({name: family(name) for name in KINDS['outside']})
+    row = {'case': case.name, 'kind': case.kind, 'controller': ('nmpc', 'rl')[case.number % 2]}
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            row |= compared(case, row['controller'], base, Path(folder))
+    except Exception as error:      # of one case; the others continue
+        row['failure'] = f'{type(error).__name__}: {error}'
+    return row | {'cpu_s': round(process_time() - began, 1)}
+
+
+def compared(case, controller, base, folder):
+    """Answers about three flights of a plant, and their correlations with the true force."""
+    rng = np.random.default_rng([case.seed, list(KINDS).index(case.kind), case.number])
+    for lost in range(TRIES):
+        truth = {} if case.kind == UNDISTURBED else {case.effect: drawn(case.effect, base, rng)}
+        plant, paths = replace(base, effects=truth), [folder / f'{lost}_{i}' for i in range(3)]
+        if all(flown := fly(controller, base, plant, int(rng.integers(2**31)), path)
+               for path in paths):
+            break
+    else:
+        raise RuntimeError(f'{TRIES} flights are lost')
+    robot, without, corrected = (folder / f'{each}.yaml' for each in ('own', 'less', 'corrected'))
+    robot.write_text('extends: robot.yaml\n' + 'multibody: null\n' * (base.multibody is None))
+    without.write_text(f"without: [{case.effect * (case.kind == 'left_out')}]\n")
+    result = command.gap_results(paths[:2], paths[2:], robot, corrected, parameters=without,
+                                 learn=folder / 'effect.yaml', console=Console(quiet=True))
+    laws = {'': {}, '_baseline': sparse(paths[:2], base) if case.baseline else {}}
+    for effect in result['effects']:
+        if 'expressions' in effect:
+            laws[''] = {term: k['value'] for term, k in effect['parameters'].items()}
+    answers = {which: with_formula(base, law) for which, law in laws.items()} | {
+        '_all': RobotParameters.load(corrected) if result['effects'] else base}
+    before = wrench(base, base, flown(base))
+    true = wrench(plant, base, flown()) - before
+    return {'truth': truth, 'lost': lost, 'force_N': float(np.sqrt((true**2).sum(1).mean())),
+            'named': [page.label(each) for each in result['effects'] if 'expressions' not in each],
+            **{key: result[key] for key in ('verdict', 'closure')},
+            'closure_of_formula': result['formula'].get('closure'),
+            **{key: result['formula'].get(key) for key in ('reason', 'ln_bayes_factor')},
+            **{f'formula{which}': law for which, law in laws.items()},
+            **{f'correlation{which}': correlation(true, wrench(
+                other, base, flown(other)) - before) for which, other in answers.items()}}
+
+
+def line(case, row, kept=False):
+    """A row of the table."""
+    if 'failure' in row:
+        return f'{case.name:42} {row["failure"]}'
+    law = ' + '.join(f'{k:.3g} {term}' for term, k in row['formula'].items()) or row['reason']
+    numbers = [row[key] for key in ('force_N', 'correlation', 'correlation_all', 'closure',
+                                    'ln_bayes_factor')]
+    if case.baseline:
+        law += f" | baseline {row['correlation_baseline']:.3g}, " \
+            f"{len(row['formula_baseline'])} terms"
+    return f"{case.name:42} {row['controller']:4} " + ' '.join(
+        '     -' if each is None else f'{each:6.3g}' for each in numbers) + (
+        f" {', '.join(row['named']) or '-'} | {law}")
+
+
+def summary(rows):
+    """Counts of one kind of cases."""
+    own = [row for row in rows if 'failure' not in row]
+    laws = [row for row in own if row['formula']]
+    return {'cases': len(rows), 'failures': len(rows) - len(own), 'formulas': len(laws),
+            **{f'rediscovered{which}': sum(bool(
+                row[f'correlation{which}'] >= LIKE and row['closure'] >= CLOSED)
+                for row in laws) for which in ('', '_all')},
+            'named_without_formula': sum(bool(row['named']) for row in own if row not in laws),
+            'baseline_formulas': sum(bool(row['formula_baseline']) for row in own),
+            'baseline_correlated': sum(row['correlation_baseline'] >= LIKE for row in own)}
+
+
+def main():
+    """Run the cases that are missing and print what all of them show."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--only', choices=KINDS, help='one kind of cases')
+    parser.add_argument('--cases', type=int, help='of each kind (each effect, 50 undisturbed)')
+    parser.add_argument('--jobs', type=int, help='at a time (every core)')
+    parser.add_argument('--baseline', action='store_true', help='also plain sparse regression')
+    parser.add_argument('--out', type=Path, default=Path('runs_out/formulas.json'),
+                        help='results; finished cases are kept in a folder beside it')
+    given = parser.parse_args()
+    if given.baseline and importlib.util.find_spec('pysindy') is None:
+        parser.error('--baseline: expected the package pysindy, found none')
+    code = digest(*(path.read_bytes() for path in (
+        Path(__file__), *sorted(SOURCE.rglob('*.py')))))
+    cases = [(kind, names[k % len(names)], k, given.seed, given.baseline)
+             for kind, names in KINDS.items() if given.only in (None, kind)
+             for k in range(given.cases or (50 if kind == UNDISTURBED else len(names)))]
+    calls = [(Case(' '.join(map(str, case[:3])), digest(code, repr(case)), 1, *case),)
+             for case in cases]
+    console = Console(width=250)
+    console.print(f'{"case":42} by    force [N], correlation of the formula, with the entries '
+                  'named beside it, closure, ln B, these entries | formula')
+    rows = sweep(examined, calls, store=Store(given.out.with_suffix('')), jobs=given.jobs,
+                 console=console, line=line)
+    counts = {kind: summary(own) for kind in KINDS if (
+        own := [row for row in rows if row['kind'] == kind])}
+    given.out.write_text(json.dumps({'seed': given.seed, 'summary': counts, 'cases': rows},
+                                    indent=1))
+    console.print_json(json.dumps(counts))
+
+
+if __name__ == '__main__':
+    main()
