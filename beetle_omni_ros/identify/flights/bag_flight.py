@@ -23,7 +23,7 @@ from beetle_omni_ros.identify.flights.servo import (
     undescribed_load,
     Windows,
 )
-from beetle_omni_ros.identify.flights.signals import Signals
+from beetle_omni_ros.identify.flights.signals import IMU_LAG, Signals
 from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear
 from beetle_omni_ros.identify.recording.bag import COMMAND, Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
@@ -38,6 +38,10 @@ PLACE = {'B': slice(0, 6), 'A': slice(6, 9), 'W': slice(9, 12), 'J': slice(12, 1
 # Time shift of an encoder reading, and of a pose of MoCap, for each second of delay of a sensor.
 SHIFTS = dict.fromkeys(delays_of('imu'), -1.0) | dict.fromkeys(delays_of('encoders'), 1.0)
 POSE_SHIFTS = dict.fromkeys(delays_of('imu'), -1.0) | dict.fromkeys(delays_of('mocap'), 1.0)
+# Keys that act on the tilts of a servo model, and others that act on them alike.
+TILTING = {TILT_BUS: (TILT_BUS, IMU_LAG, 'command_latency.delay', 'joint_command_latency.delay'),
+           'joint_bandwidth.kp': ('joint_bandwidth.kp',),
+           'joint_bandwidth.kd': ('joint_bandwidth.kd',)}
 # Parameters with central differences. With one-sided ones, slopes of equivalent delays differ by
 # the second derivative, and a linear fit exploits the difference.
 BOTH_SIDES = 'delay'
@@ -197,13 +201,17 @@ class BagFlight:
 
     def _guided(self, theta, groups):
         """Residual with the tilts of the servo model at ``theta``, where they are of a model."""
-        s = self.signals
-        before, run = s.model_tilts, self._runs.get(frozenset(theta.items()))
-        if before is None or run is None:
+        run = self._runs.get(frozenset(theta.items()))
+        if self.signals.model_tilts is None or run is None:
             return self.residual(theta, groups)
+        return self._with_tilts(run, theta, groups)
+
+    def _with_tilts(self, run, theta, groups):
+        """Residual at ``theta`` with the fast tilts of simulated servos."""
+        before = self.signals.model_tilts
         self._use_tilts(before, run)
         result = self.residual(theta, groups)
-        s.use_model_tilts(before)
+        self.signals.use_model_tilts(before)
         return result
 
     def _measured(self, theta):
@@ -255,7 +263,19 @@ class BagFlight:
         turning = [name for name in names if 'J' in self.keys[name].groups]
         for name, slope in zip(turning, self._joint_slopes(theta, turning), strict=True):
             slopes[:, PLACE['J'], names.index(name)] = slope
+        if self.signals.model_tilts is not None:
+            for source, alike in TILTING.items():
+                slope = self._of_model_tilts(theta, source)
+                for name in set(alike) & set(names):
+                    slopes[:, PLACE['B'], names.index(name)] += slope
         return slopes
+
+    def _of_model_tilts(self, theta, name):
+        """Derivative (M, 6) of forces and torques by a key that acts on the servo model."""
+        h, here = self.keys[name].step, theta.get(name, 0.0)
+        ahead, behind = (self._with_tilts(run, theta, 'B')['B'] for run in self._servos(
+            [{**theta, name: here + side * h} for side in (1, -1)], theta))
+        return (ahead - behind) / (2 * h)
 
     def _of_pose_shift(self, theta):
         """
