@@ -12,7 +12,7 @@ from beetle_omni_ros.identify.flights.evidence import Judge, log_prior, normal, 
 from beetle_omni_ros.identify.flights.linearised import FORM, GROUPS, Linearised
 from beetle_omni_ros.identify.flights.spectrum import EDGES, Spectrum
 
-ROUNDS, MOST_ROUNDS = 3, 6      # linearisations; more than the least until the best set stays
+ROUNDS, MOST_ROUNDS = 3, 6      # linearisations; more until the best set and its values stay
 MOST = 8                # entries of a set
 PAIRED = 20             # entries whose pairs are all weighed; others follow from the best set
 
@@ -33,7 +33,11 @@ class Engine(Linearised):
             turn += 1
             spectra = self._linearised(theta, etas, spectra)
             solution = self._steady(spectra)
-            if turn == MOST_ROUNDS or turn >= ROUNDS and solution.best == best:
+            own = self.indices(solution.best)
+            stays = solution.best == best and (
+                np.abs(solution.theta[own] - theta[own]) <= self.typical[own])[
+                    ~self.curved[own]].all()
+            if turn == MOST_ROUNDS or turn >= ROUNDS and stays:
                 return self._with_plain(solution)
             best = solution.best
             theta, etas = self._next(solution)

@@ -210,7 +210,7 @@ class Linearised:
     def _linearised(self, theta, etas, before):
         """Spectra at a point; their noise begins at that of the spectra ``before``, if any."""
         self._settle(theta, etas)
-        self.acting = self.curved & (theta[:self.known] == 1)
+        self.acting, self.point = self.curved & (theta[:self.known] == 1), theta
         spectra = self._spectra(theta, etas)
         for each, still in zip(spectra, self.still, strict=True):
             each.hidden = still
@@ -222,19 +222,22 @@ class Linearised:
 
     def _restarted(self, theta, etas, spectra):
         """
-        The point ``theta``, with starts moved to their fitted values.
+        The point ``theta``, with starts moved to their fitted values, or a part of the way there.
 
-        A secant is valid up to its start. Of some parts of the step from it, that one is made
-        which leaves least of the flights.
+        A secant is valid up to its start, and a slope for typical sizes. If the step is larger,
+        that part of it is made which leaves least of the flights.
         """
-        if not theta[:self.known][self.curved].any():
+        step = theta - self.point
+        step[:self.known][self.curved] = 0.0
+        if not theta[:self.known][self.curved].any() \
+                and (np.abs(step) <= self.typical)[:self.known].all():
             return theta
         starts, points = self.flights[0].starts, []
         fitted = dict(zip(self.names, theta[:self.known], strict=False))
         before = {name: dict(start) for name, start in starts.items()}
         for part in STEPS:
             starts.update({name: dict(start) for name, start in before.items()})
-            at = theta.copy()
+            at = theta - (1 - part) * step
             for name, value in self.flights[0].restart(fitted, part).items():
                 at[self.index[name]] = value
             left = sum(self._left(k, at + eta, found) for k, (eta, found) in enumerate(
