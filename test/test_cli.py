@@ -106,15 +106,6 @@ def test_check_ends_with_its_file_and_what_was_skipped_as_next(capsys, tmp_path)
     assert capsys.readouterr().out.endswith(f'files: {result}\nnext:  beetle_omni check\n')
 
 
-def test_gap_does_not_propose_a_page_that_it_has_just_written(capsys, tmp_path):
-    page, logs = tmp_path / 'page.html', sorted((ROOT / 'test/data/nanobench').glob('*.gz'))
-    assert cli.main(['gap', str(logs[0]), '--format', 'nanobench', '--robot',
-                     str(ROOT / 'params' / 'crazyflie.yaml'), '--report', str(page)]) == 0
-    *_, then, last = capsys.readouterr().out.splitlines()
-    assert then == f'next:  open {page} in a browser'
-    assert last.startswith('next:  the same with --apply FILE') and '--report' not in last
-
-
 @pytest.mark.parametrize(('command', 'folder', 'module', 'remedy'), [
     ('fly --bag never', 'ros', 'rclpy', 'beetle_omni_ros[ros]'),
     ('train --smoke --output never', 'train', 'torch',

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 import pydoc
 import re
+import runpy
 import subprocess
 import sys
 
@@ -30,30 +31,38 @@ def poses(tmp_path_factory):
     return path
 
 
-def run(name, *arguments):
-    """Run an example and return what it prints."""
-    done = subprocess.run([sys.executable, EXAMPLES / name, *map(str, arguments)], cwd=ROOT,
-                          env={'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1',
-                               'PATH': '/usr/bin:/bin', 'HOME': str(Path.home())},
-                          capture_output=True, text=True, timeout=250, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Run an example in this process, which has loaded the modules; return what it prints."""
+    def example(name, *arguments):
+        path = str(EXAMPLES / name)
+        monkeypatch.setattr(sys, 'argv', [path, *map(str, arguments)])
+        runpy.run_path(path, run_name='__main__')
+        return capsys.readouterr().out
+
+    return example
 
 
-def test_an_own_controller_flies_beside_the_nmpc(poses):
+def test_an_own_controller_flies_beside_the_nmpc(run, poses):
     printed = run('own_controller.py', poses)
     assert re.search(r'poses reached +1 of 1 +1 of 1', printed)
     assert 'pose_controller' in printed
 
 
 def test_an_own_trajectory_is_followed_by_both_controllers():
-    printed = run('own_trajectory.py', 2)
+    done = subprocess.run(
+        [sys.executable, 'examples/own_trajectory.py', '2'], cwd=ROOT, capture_output=True,
+        text=True, timeout=250, check=False,
+        env={'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1', 'PATH': '/usr/bin:/bin',
+             'HOME': str(Path.home())})
+    assert done.returncode == 0, done.stderr
+    printed = done.stdout
     errors = dict(re.findall(r'^(nmpc|rl): ([\d.]+) mm', printed, re.MULTILINE))
     assert {'nmpc', 'rl'} == set(errors) and max(map(float, errors.values())) < 100
     assert 'Trajectory tracking' in printed and 'poses reached' not in printed
 
 
-def test_an_own_robot_flies_with_known_and_unknown_parameters(poses):
+def test_an_own_robot_flies_with_known_and_unknown_parameters(run, poses):
     printed = run('own_robot.py', poses)
     assert printed.startswith('3.4 kg') and 'unknown robot' in printed
 
@@ -69,7 +78,7 @@ def test_a_flight_can_be_stepped_by_the_caller():
     assert log.states[-1].controller == 'hover' and len(log.command.t) > 400
 
 
-def test_a_bag_becomes_arrays():
+def test_a_bag_becomes_arrays(run):
     printed = run('read_bag.py', flight('windy_0'))
     assert 'IMU samples' in printed and 'hover asked for' in printed
     median, last, end = map(float, re.search(

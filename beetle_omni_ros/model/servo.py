@@ -133,11 +133,15 @@ def play(positions: np.ndarray, half: float | np.ndarray) -> np.ndarray:
 
     ``positions`` (K, ...) are those of the driving side, on which the shaft begins.
     """
-    made, shown = [], positions[0]
-    for low, high in zip(positions - half, positions + half, strict=True):
-        shown = np.minimum(np.maximum(shown, low), high)
-        made.append(shown)
-    return np.array(made)
+    low, high = positions - half, positions + half
+    low[0] = high[0] = positions[0]
+    span = 1        # clamps in a row are one clamp: doubling takes log K steps
+    while span < len(low):
+        least, most = low[span:], high[span:]
+        low[span:], high[span:] = (np.minimum(np.maximum(end, least), most)
+                                   for end in (low[:-span], high[:-span]))
+        span *= 2
+    return low
 
 
 def _within(space, value, limit):

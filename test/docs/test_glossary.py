@@ -2,6 +2,7 @@
 
 import ast
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 import re
 
@@ -9,6 +10,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / 'beetle_omni_ros'
 
 
+@cache
 def modules_of_classes():
     """Class -> modules of the package that define it."""
     places = defaultdict(set)

@@ -1,5 +1,6 @@
 """The flight engine against dense algebra, quadrature, and flights with known effects."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
+from beetle_omni_ros import cli
 from beetle_omni_ros.identify.flights.command import gap_results
 from beetle_omni_ros.identify.flights.evidence import Judge, normal
 from beetle_omni_ros.identify.flights.spectrum import EDGES, spectrum
@@ -193,9 +195,12 @@ def named(result):
     return {name for effect in result['effects'] for name in effect['names']}
 
 
-def test_a_hidden_thrust_and_drag_are_named_with_their_sizes(tmp_path):
+def test_a_hidden_thrust_and_drag_are_named_with_their_sizes(tmp_path, capsys):
     flights = [write_flight(tmp_path / f'{k}.csv', k, scale=0.8, drag=0.012) for k in range(3)]
-    result = gap_of(flights)
+    page, file = tmp_path / 'gap.html', tmp_path / 'gap.json'
+    assert cli.main(list(map(str, ['gap', *flights, '--format', 'nanobench', '--robot', ROBOT,
+                                   '--report', page, '--json', file]))) == 0
+    result = json.loads(file.read_text())
     found = {effect['names'][0]: effect['parameters'] for effect in result['effects']}
     assert {'thrust_coefficient', 'rotor_drag'} == set(found)
     for name, key, true in (('thrust_coefficient', 'scale', 0.8),
@@ -204,6 +209,10 @@ def test_a_hidden_thrust_and_drag_are_named_with_their_sizes(tmp_path):
         assert low - 0.01 * true <= true <= high + 0.01 * true
     assert result['false_alarm_probability'] < 1e-3
     assert result['gap_after'] < 0.2 * result['gap_before'] + 0.8
+    # no page is proposed that has just been written
+    *_, then, last = capsys.readouterr().out.splitlines()
+    assert then == f'next:  open {page} in a browser' and '--report' not in last
+    assert last.startswith('next:  the same with --apply FILE')
 
 
 def test_flights_of_the_robot_of_the_file_have_no_named_effect(tmp_path):

@@ -23,7 +23,7 @@ def gap(bags, **more):
 
 
 def test_two_calm_hovers_show_only_means_and_name_nothing(tmp_path):
-    result = gap(flown(tmp_path, 'hover'))
+    result = gap(flown(tmp_path, 4 * [[0, 0, 1, 0, 0, 0]]))
     assert not result['effects'] and result['false_alarm_probability'] > 0.05
     for kind in ('force', 'acceleration', 'rate'):
         assert 'only means' in result['groups'][kind]['reason']

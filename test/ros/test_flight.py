@@ -182,7 +182,7 @@ def test_a_fall_in_the_landing_is_the_last_line_with_its_likely_cause(tmp_path, 
 
 
 def test_a_full_disk_ends_the_flight_with_one_line_and_the_bag_is_readable(tmp_path):
-    task, bag, limit = tmp_path / 'poses.csv', tmp_path / 'bag', 3 * 2**20
+    task, bag, limit = tmp_path / 'poses.csv', tmp_path / 'bag', 2 * 2**20
     task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
     done = subprocess.run(
         [sys.executable, '-m', 'beetle_omni_ros', 'fly', '--task', str(task), '--bag',
