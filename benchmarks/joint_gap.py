@@ -22,7 +22,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.servo import compare as servo_compare
 from beetle_omni_ros.identify.servo.compare import compare, gap_of
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
@@ -56,9 +55,6 @@ def changed(sets: np.ndarray, log: JointLog, kind: str, rng: np.random.Generator
     def sized(low, high):
         return float(rng.uniform(low, high) * rng.choice([-1, 1]))
 
-    def moved(term, by, which):
-        sets[which, INDEX[term]] += by
-
     if kind == 'nothing':
         return sets, set(), ''
     if kind in ('zero', 'two zeros', 'encoder gain'):
@@ -68,7 +64,7 @@ def changed(sets: np.ndarray, log: JointLog, kind: str, rng: np.random.Generator
             by = sized(*SIZE)
             if kind == 'encoder gain':
                 by /= np.abs(log.measured[j]).max()
-            moved('encoder_gain' if kind == 'encoder gain' else 'offset', by, j)
+            sets[j, INDEX['encoder_gain' if kind == 'encoder gain' else 'offset']] += by
             words.append(f'joint {log.joints[j]} {by:+.4f}')
         return sets, {(name, log.joints[j]) for j in joints}, ', '.join(words)
     which = slice(None) if kind == 'delay' or rng.random() < 0.5 else joints[:1]
@@ -81,14 +77,14 @@ def changed(sets: np.ndarray, log: JointLog, kind: str, rng: np.random.Generator
     elif kind == 'delay':
         by = sized(0.008, 0.020)
         by = by if sets[:, INDEX['delay']].min() + by >= 0 else -by
-        moved('delay', by, which)
+        sets[which, INDEX['delay']] += by
         words = f'{1e3 * by:+.1f} ms'
     else:
         term = 'coulomb_friction' if kind == 'friction' else 'backlash'
         by = float(rng.uniform(*SIZE))
         if rng.random() < 0.5 and sets[which, INDEX[term]].min() > by:
             by = -by
-        moved(term, by, which)
+        sets[which, INDEX[term]] += by
         words = f'{1e3 * by:+.1f} mrad'
     return sets, {(name, None)}, words + (
         '' if which == slice(None) else f', joint {log.joints[joints[0]]}')
@@ -136,25 +132,10 @@ def scored(made: dict, wanted: set) -> dict:
             'verdict': made['verdict']}
 
 
-def own_correction(log: JointLog, robot: RobotParameters) -> dict:
-    """Verdicts of a log against the shipped file, and against its correction by that."""
-    found = identify([log], robot)
-    first = gap_of(compare(log, robot), found, robot)
-    second = robot_with(robot, effects_with(robot, first['effects']))     # as --apply writes
-    again = gap_of(compare(log, second), identify([log], second), second)
-    return {'verdict': first['verdict'], 'names': [e['names'] for e in first['effects']],
-            'reason': first['reason'], 'verdict_corrected': again['verdict'],
-            'names_corrected': [e['names'] for e in [*again['effects'], *again['partial']]],
-            'reason_corrected': again['reason']}
-
-
 def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> dict:
-    """Results of real logs with their own correction, and of ``cases`` artificial logs."""
-    robot, rows, real, sets = RobotParameters.load(), [], {}, {}
-    for log in logs:
-        real[log.name] = own_correction(log, robot)
-        console.print(f'{log.name}: {real[log.name]}', highlight=False, markup=False)
-        sets[log.name] = identify([log], robot).values()
+    """Results of ``cases`` artificial logs."""
+    robot, rows = RobotParameters.load(), []
+    sets = {log.name: identify([log], robot).values() for log in logs}
     for k in range(cases):
         rng = np.random.default_rng([seed, k])
         kind, log = list(KINDS)[k % len(KINDS)], logs[k // len(KINDS) % len(logs)]
@@ -167,16 +148,13 @@ def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> di
                'effects': [[e['names'], e.get('joint'), {
                    key: e['parameters'][key].get('each', e['parameters'][key]['value'])
                    for key in e['parameters']}] for e in [*made['effects'], *made['partial']]],
-               'gains': {c['name']: [c['evidence']['ln_bayes_factor'], c['evidence']['cv_gain'],
-                                     c['evidence']['blocks_positive']]
-                         for c in made['candidates']},
                'seconds': time.process_time() - begin}
         rows.append(row)
         mark = '' if row['named'] and not row['wrong'] else '  <-'
         console.print(f"{k} {log.name} {kind} {words} ({way}): {row['verdict']} "
                       f"{[e[:2] for e in row['effects']]}{mark}",
                       highlight=False, markup=False, soft_wrap=True)
-    return {'seed': seed, 'real': real, 'cases': rows}
+    return {'seed': seed, 'cases': rows}
 
 
 def table(made: dict) -> Table:

@@ -9,8 +9,8 @@ change by at most 0.02 rad (RMS) within 10 ms at the target. Bisection gives the
 and the smallest other value. It assumes that every larger value is not tolerated either.
 
 The linear margins are those of level hover, from the Jacobians of controller and robot, without
-the supervisor, the estimator of the state and noise; `--plants ''` flies none. `--policy` is that
-of `rl`. All flights take half an hour of 16 cores.
+the supervisor, the estimator of the state and noise; `--plants ''` flies none. All flights take
+half an hour of 16 cores.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from beetle_omni_ros.bags.metrics import metrics
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, PoseTarget, State
 from beetle_omni_ros.control.latency import NoiseFilter
-from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.campaign import workers
 from beetle_omni_ros.flight.evaluate import fly
@@ -84,12 +83,12 @@ QUANTITIES = {
     'less thrust [1]': (other_thrust, 1.0, 0.36, 0.04)}
 
 
-def flown(controller, plant, effects, task, seed, options):
+def flown(controller, plant, effects, task, seed):
     """Reached poses, chatter [rad] and mean U [deg] of a flight, and whether it is tolerated."""
     true = replace(plant, effects={**plant.effects, **validated(effects)})
     try:
         result = metrics(fly(controller, task, robot=RobotParameters.load(), plant=true,
-                             seed=seed, options=options), task)
+                             seed=seed), task)
     except RunError as error:       # no take-off
         return {'reached': 0, 'error': str(error), 'tolerated': False}
     reached = sum(pose['reached'] for pose in result['poses'])
@@ -103,12 +102,11 @@ def margin(controller, plant, quantity, chosen):
     """Bisect one quantity of one controller on one plant; None if nothing is tolerated."""
     effect, none, most, resolution = QUANTITIES[quantity]
     robot, task = RobotParameters.load(plant), make_task(chosen.task, chosen.seed)
-    options = {'rl': ControllerOptions(policy=chosen.policy)} if chosen.policy else {}
     flights = []
 
     def tolerated(value):
-        flights.append({'value': value, **flown(controller, robot, effect(robot, value), task,
-                                                chosen.seed, options)})
+        flights.append({'value': value, **flown(
+            controller, robot, effect(robot, value), task, chosen.seed)})
         return flights[-1]['tolerated']
 
     good, bad = none, most
@@ -130,11 +128,6 @@ def state_at(stamp, x, error, command):
     return State(stamp, x[model.POSITION] + error[:3], x[model.VELOCITY] + error[3:6],
                  turn.as_quat(), x[model.RATE] + error[9:12], x[model.TILT] + error[12:],
                  np.zeros(4), stamp - PERIOD, command)
-
-
-def command_of(stamp, values):
-    """Command with tilts and thrusts (8,)."""
-    return Command(stamp, values[:4].copy(), values[4:].copy())
 
 
 def equilibrium(controller, advance, robot):
@@ -161,8 +154,8 @@ def controller_response(controller, x, u, target):
         made = []
         for k in range(EMPTY + LENGTH):
             given = impulse if k == EMPTY else np.zeros(24)
-            command = controller.step(state_at(k * PERIOD, x, given[:16], command_of(
-                (k - 1) * PERIOD, u + given[16:])), target)
+            command = controller.step(state_at(k * PERIOD, x, given[:16], Command(
+                (k - 1) * PERIOD, *np.split(u + given[16:], 2))), target)
             made.append(np.r_[command.tilt, command.thrust])
         return np.array(made[EMPTY:])
 
@@ -191,11 +184,10 @@ def robot_response(advance, x, u):
     return np.concatenate([response[:, :12], response[:, 12:16] / z], 1)    # encoders are late
 
 
-def linear_margins(controller, options):
+def linear_margins(controller):
     """Margins of delay [ms], phase [deg] and gain [1] at hover: commands, tilts, thrusts."""
     robot = RobotParameters.load()
-    flying = registry.find(controller).make(robot, options.get(controller, ControllerOptions()))
-    advance = model.integrator(robot)
+    flying, advance = registry.find(controller).make(robot), model.integrator(robot)
     x, u, target = equilibrium(flying, advance, robot)
     # alone, an impulse would be noise
     with patch.object(NoiseFilter, 'without', lambda self, error, step: error):
@@ -247,15 +239,13 @@ def main() -> None:
     parser.add_argument('--plants', default='robot,measured')
     parser.add_argument('--task', default='random10')
     parser.add_argument('--seed', type=int, default=5)
-    parser.add_argument('--policy', type=Path)
     parser.add_argument('--jobs', type=int, default=-1)
     parser.add_argument('--json', type=Path)
     chosen = parser.parse_args()
     plants = {name: 'params/robot.yaml' if name == 'robot' else name
               for name in chosen.plants.split(',') if name}
     names = chosen.controllers.split(',')
-    options = {'rl': ControllerOptions(policy=chosen.policy)} if chosen.policy else {}
-    linear = [linear_margins(name, options) for name in names]
+    linear = [linear_margins(name) for name in names]
     cases = [(name, plant, quantity) for quantity in QUANTITIES for plant in plants.values()
              for name in names]
     console, rows = Console(width=None if sys.stdout.isatty() else 140), []
