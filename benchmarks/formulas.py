@@ -30,6 +30,7 @@ from beetle_omni_ros.identify.flights import bag_flight, body, command, page, tr
 from beetle_omni_ros.identify.flights.keys import all_keys, ARM, extra_keys, LIMITS
 from beetle_omni_ros.identify.recording import bag, flight, parameters
 from beetle_omni_ros.model import dynamics, effects, formula, terms
+from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import RobotParameters
 
 LIKE, CLOSED = 0.95, 0.8    # least correlation and closure of a law that is rediscovered
@@ -273,7 +274,7 @@ def summary(rows):
     own = [row for row in rows if 'failure' not in row]
     laws = [row for row in own if row['formula']]
     return {'cases': len(rows), 'failures': len(rows) - len(own), 'formulas': len(laws),
-            'rediscovered': sum(row['correlation'] >= LIKE and row['closure'] >= CLOSED
+            'rediscovered': sum(bool(row['correlation'] >= LIKE and row['closure'] >= CLOSED)
                                 for row in laws),
             'named_without_formula': sum(bool(row['named']) for row in own if row not in laws),
             'baseline_formulas': sum(bool(row['formula_baseline']) for row in own),
@@ -293,11 +294,11 @@ def main():
     given = parser.parse_args()
     code = digest(*(path.read_bytes() for path in (
         Path(__file__), *sorted(SOURCE.rglob('*.py')))))
-    cases = [(kind, names[k % len(names)], k, given.seed, given.baseline)
+    cases = [Case(f'{kind} {names[k % len(names)]} {k}', code, 1, kind, names[k % len(names)], k,
+                  given.seed, given.baseline)
              for kind, names in KINDS.items() if given.only in (None, kind)
              for k in range(given.cases or (50 if kind == UNDISTURBED else len(names)))]
-    calls = [(Case(' '.join(map(str, case[:3])), digest(code, repr(case)), 1, *case),)
-             for case in cases]
+    calls = [(case._replace(key=digest(repr(case))),) for case in cases]
     console = Console(width=250)
     console.print(f'{"case":42} by    force [N], correlation of the formula, with the entries '
                   'named beside it, closure, ln B, these entries | formula')
@@ -305,8 +306,7 @@ def main():
                  console=console, line=line)
     counts = {kind: summary(own) for kind in KINDS if (
         own := [row for row in rows if row['kind'] == kind])}
-    given.out.write_text(json.dumps({'seed': given.seed, 'summary': counts, 'cases': rows},
-                                    indent=1))
+    write_json(given.out, {'seed': given.seed, 'summary': counts, 'cases': rows})
     console.print_json(json.dumps(counts))
 
 

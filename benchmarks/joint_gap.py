@@ -1,7 +1,7 @@
 """
 Detection of servo changes by `beetle_omni gap LOG.csv`, and false detections.
 
-`python benchmarks/joint_gap.py --cases 48 --seed 1 --json joint_gap.json`. The servos of each real
+`python benchmarks/joint_gap.py --cases 48 --seed 1`. The servos of each real
 log are identified. Each case is an artificial log: a simulation of the identified servos with one
 change, plus the residual of the real log, rounded to encoder counts. The residual is used
 unchanged, circularly shifted, or in blocks of a second drawn at random. The log is compared with
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-import json
 from pathlib import Path
 import sys
 import time
@@ -132,7 +131,7 @@ def scored(made: dict, wanted: set) -> dict:
             'verdict': made['verdict']}
 
 
-def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> dict:
+def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> list[dict]:
     """Results of ``cases`` artificial logs."""
     robot, rows = RobotParameters.load(), []
     sets = {log.name: identify([log], robot).values() for log in logs}
@@ -143,26 +142,22 @@ def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> di
         after, wanted, words = changed(before, log, kind, rng)
         begin, way = time.process_time(), WAYS[rng.integers(3)]
         made = judged(made_log(log, before, after, way, rng), before, robot)
-        row = {'kind': kind, 'case': k, 'log': log.name, 'change': words, 'residual': way,
-               **scored(made, wanted), 'reason': made['reason'],
-               'effects': [[e['names'], e.get('joint'), {
-                   key: e['parameters'][key].get('each', e['parameters'][key]['value'])
-                   for key in e['parameters']}] for e in [*made['effects'], *made['partial']]],
-               'seconds': time.process_time() - begin}
+        row = {'kind': kind, **scored(made, wanted), 'seconds': time.process_time() - begin}
         rows.append(row)
+        effects = [[e['names'], e.get('joint')] for e in [*made['effects'], *made['partial']]]
         mark = '' if row['named'] and not row['wrong'] else '  <-'
         console.print(f"{k} {log.name} {kind} {words} ({way}): {row['verdict']} "
-                      f"{[e[:2] for e in row['effects']]}{mark}",
+                      f'{effects}{mark}',
                       highlight=False, markup=False, soft_wrap=True)
-    return {'seed': seed, 'cases': rows}
+    return rows
 
 
-def table(made: dict) -> Table:
+def table(made: list[dict], seed: int) -> Table:
     """Counts by kind of change."""
     shown = Table('change', 'logs', 'named', 'alone', 'wrong names', 'no gap', 'unknown', 'CPU s',
-                  title=f"Joint logs, seed {made['seed']}")
+                  title=f'Joint logs, seed {seed}')
     for kind in [*KINDS, None]:
-        rows = [row for row in made['cases'] if kind in (row['kind'], None)
+        rows = [row for row in made if kind in (row['kind'], None)
                 and (kind or row['kind'] != 'nothing')]
         if rows:
             shown.add_row(kind or 'all changes', *(str(x) for x in (
@@ -182,16 +177,13 @@ def main() -> int:
                         help='real joint logs')
     parser.add_argument('--cases', type=int, default=24, help='made logs')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--json', type=Path, help='file for the results')
     given = parser.parse_args()
     if not given.logs:
         print(f'{DATA}: no joint_*.csv; name logs with --logs', file=sys.stderr)
         return 2
     console = Console()
     made = run([read_joint_log(path) for path in given.logs], given.cases, given.seed, console)
-    console.print(table(made))
-    if given.json:
-        given.json.write_text(json.dumps(made, indent=1))
+    console.print(table(made, given.seed))
     return 0
 
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-import json
 from pathlib import Path
 import sys
 from unittest.mock import patch
@@ -38,11 +37,12 @@ from beetle_omni_ros.flight.campaign import workers
 from beetle_omni_ros.flight.evaluate import fly
 from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.model.effects import validated
+from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 
 CHATTER, ANGLE = 0.02, 2.0      # [rad] of the tilt commands in 10 ms, [deg]: tolerated
-PERIOD, HEIGHT = 0.01, 1.0
+PERIOD, HEIGHT, SEED = 0.01, 1.0, 5
 SETTLING, EMPTY, LENGTH = 1000, 40, 300     # steps to the equilibrium, before and after an impulse
 SIZE = 1e-3             # of an impulse [m, m/s, rad, rad/s, N]
 PARTS = 'commands', 'tilts', 'thrusts'
@@ -83,12 +83,13 @@ QUANTITIES = {
     'less thrust [1]': (other_thrust, 1.0, 0.36, 0.04)}
 
 
-def flown(controller, plant, effects, task, seed):
+def flown(controller, plant, effects):
     """Reached poses, chatter [rad] and mean U [deg] of a flight, and whether it is tolerated."""
+    task = make_task('random10', SEED)
     true = replace(plant, effects={**plant.effects, **validated(effects)})
     try:
         result = metrics(fly(controller, task, robot=RobotParameters.load(), plant=true,
-                             seed=seed), task)
+                             seed=SEED), task)
     except RunError as error:       # no take-off
         return {'reached': 0, 'error': str(error), 'tolerated': False}
     reached = sum(pose['reached'] for pose in result['poses'])
@@ -98,15 +99,13 @@ def flown(controller, plant, effects, task, seed):
         reached == len(task.poses) and chatter <= CHATTER and angle <= ANGLE)}
 
 
-def margin(controller, plant, quantity, chosen):
+def margin(controller, plant, quantity):
     """Bisect one quantity of one controller on one plant; None if nothing is tolerated."""
     effect, none, most, resolution = QUANTITIES[quantity]
-    robot, task = RobotParameters.load(plant), make_task(chosen.task, chosen.seed)
-    flights = []
+    robot, flights = RobotParameters.load(plant), []
 
     def tolerated(value):
-        flights.append({'value': value, **flown(
-            controller, robot, effect(robot, value), task, chosen.seed)})
+        flights.append({'value': value, **flown(controller, robot, effect(robot, value))})
         return flights[-1]['tolerated']
 
     good, bad = none, most
@@ -237,8 +236,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--controllers', default='nmpc,rl,rl_any')
     parser.add_argument('--plants', default='robot,measured')
-    parser.add_argument('--task', default='random10')
-    parser.add_argument('--seed', type=int, default=5)
     parser.add_argument('--jobs', type=int, default=-1)
     parser.add_argument('--json', type=Path)
     chosen = parser.parse_args()
@@ -251,7 +248,7 @@ def main() -> None:
     console, rows = Console(width=None if sys.stdout.isatty() else 140), []
     with workers(jobs=chosen.jobs):
         for row in joblib.Parallel(batch_size=1, return_as='generator')(
-                joblib.delayed(margin)(*case, chosen) for case in cases):
+                joblib.delayed(margin)(*case) for case in cases):
             rows.append(row)    # a run takes long: each result at once
             console.print(f"{row['controller']}, {row['plant']}, {row['quantity']}: {shown(row)}",
                           markup=False)
@@ -267,10 +264,8 @@ def main() -> None:
         table.add_row(key, *('–' if row[part][key] is None else f'{row[part][key]:.3g}'
                              for row in linear for part in PARTS))
     console.print(table)
-    if chosen.json:
-        chosen.json.write_text(json.dumps({'meta': {
-            key: str(value) for key, value in vars(chosen).items()}, 'linear': linear,
-            'margins': rows}, indent=1) + '\n')
+    write_json(chosen.json, {'meta': {key: str(value) for key, value in vars(chosen).items()},
+                             'linear': linear, 'margins': rows})
 
 
 if __name__ == '__main__':

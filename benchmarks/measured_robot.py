@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-import json
 from math import ceil
 from pathlib import Path
 import sys
@@ -35,6 +34,7 @@ from beetle_omni_ros.flight.campaign import workers
 from beetle_omni_ros.flight.evaluate import fly
 from beetle_omni_ros.model.allocation import Allocator
 from beetle_omni_ros.model.degraded import sphere
+from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import mass_properties, RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
@@ -165,10 +165,8 @@ def main() -> None:
     for row in rows:
         for alarm in row['alarms']:
             console.print(f"{row['controller']}, {row['kind']}, {alarm}", markup=False)
-    if chosen.json:
-        chosen.json.write_text(json.dumps(
-            {'meta': {key: str(value) for key, value in vars(chosen).items()}, 'summary': rows,
-             'flights': flights}, indent=1))
+    write_json(chosen.json, {'meta': {key: str(value) for key, value in vars(chosen).items()},
+                             'summary': rows, 'flights': flights})
 
 
 if __name__ == '__main__':
