@@ -113,8 +113,7 @@ def main():
     try:
         device = choose_device(parser.parse_args().device)
     except ParameterError as error:
-        print(f'benchmarks/environment.py: error: {error}', file=sys.stderr)
-        sys.exit(2)
+        parser.error(str(error))
     gpu = device.startswith('cuda')
     torch.set_float32_matmul_precision('high')
     if not gpu:

@@ -13,7 +13,6 @@ import argparse
 from collections import namedtuple
 from contextlib import closing
 from dataclasses import replace
-import json
 from pathlib import Path
 import tempfile
 from time import process_time
@@ -133,30 +132,27 @@ def fly(controller, robot, plant, seed, path):
         if not loop.fly(make_task('random5', seed)):
             return None
         sent = loop.recording().command
-    *states, t, voltage = map(np.array, zip(*rows, strict=True))
-    made, step, voltage = dict(zip(STATES, states, strict=False)), simulator.tick, voltage[:, None]
+    *states, tilt_rate, real, t, voltage = map(np.array, zip(*rows, strict=True))
+    ratio, step, high = voltage / plant.battery.full_voltage, simulator.tick, states[0][:, 2] > LOW
     points = sorted((row.voltage, row.thrust_max) for row in robot.rotors.map)
-    most = np.interp(voltage / plant.battery.full_voltage * robot.battery.full_voltage,
-                     *zip(*points, strict=True))
-    made |= {'thrust': made['thrust'] / plant.thrust_scale, 'tilt_rate': made.pop('tilt_velocity'),
-             'voltage_ratio': voltage / plant.battery.full_voltage}
-    made |= {name: np.gradient(made[of], step, axis=0) for name, of in (
-        ('tilt_acceleration', 'tilt_rate'), ('thrust_rate', 'thrust'))}
+    most = np.interp(ratio * robot.battery.full_voltage, *zip(*points, strict=True))
 
     def flown(other=None):
         """States, name -> (N, width); the thrusts are answers to the recorded commands."""
-        more = {}
+        thrust = real / plant.thrust_scale
+        thrust_rate = np.gradient(thrust, step, axis=0)
         if other:
-            rotors = other.rotors
-            late = GAP.command_delay + other.command_delays[1]
+            rotors, late = other.rotors, GAP.command_delay + other.command_delays[1]
             at = np.searchsorted(sent.t + late, t + 1e-5, side='right') - 1
             aim = np.clip(sent.thrust[np.maximum(at, 0)], rotors.thrust_min, np.minimum(
-                rotors.thrust_max, most))
+                rotors.thrust_max, most[:, None]))
             gain = -np.expm1(-step / rotors.time_constant)
             thrust = lfilter([0, gain], [1, gain - 1], aim, axis=0)
-            more = {'thrust': thrust, 'thrust_rate': (aim - thrust) / rotors.time_constant}
-        return {name: values[made['position'][:, 2] > LOW] for name, values in (
-            made | more).items()}
+            thrust_rate = (aim - thrust) / rotors.time_constant
+        made = dict(zip(STATES, states, strict=False)) | {
+            'tilt_rate': tilt_rate, 'tilt_acceleration': np.gradient(tilt_rate, step, axis=0),
+            'thrust': thrust, 'thrust_rate': thrust_rate, 'voltage_ratio': ratio[:, None]}
+        return {name: values[high] for name, values in made.items()}
     return flown
 
 
@@ -205,16 +201,16 @@ def sparse(paths, robot):
 
 def examined(case):
     """What `gap --learn` finds of the flights of a case, and how true it is."""
-    began, controller = process_time(), ('nmpc', 'rl')[case.number % 2]
     # Of the module, because a worker has a copy of globals. Without a treatment no fit has them.
     effects.CATALOGUE.update({name: family(name) for name in KINDS['outside']})
-    row = {'case': case.name, 'kind': case.kind, 'controller': controller}
+    began, controller = process_time(), ('nmpc', 'rl')[case.number % 2]
     try:
         with tempfile.TemporaryDirectory() as folder:
-            row |= compared(case, controller, Path(folder))
+            row = compared(case, controller, Path(folder))
     except Exception as error:      # of one case; the others continue
-        row['failure'] = f'{type(error).__name__}: {error}'
-    return row | {'cpu_s': round(process_time() - began, 1)}
+        row = {'failure': f'{type(error).__name__}: {error}'}
+    return {'case': case.name, 'kind': case.kind, 'controller': controller, **row,
+            'cpu_s': round(process_time() - began, 1)}
 
 
 def compared(case, controller, folder):
@@ -307,7 +303,7 @@ def main():
     counts = {kind: summary(own) for kind in KINDS if (
         own := [row for row in rows if row['kind'] == kind])}
     write_json(given.out, {'seed': given.seed, 'summary': counts, 'cases': rows})
-    console.print_json(json.dumps(counts))
+    console.print_json(data=counts)
 
 
 if __name__ == '__main__':

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-import sys
 import time
 from unittest.mock import patch
 
@@ -41,13 +40,7 @@ KINDS = {'nothing': None, 'zero': 'joint_offset', 'two zeros': 'joint_offset',
 
 
 def changed(sets: np.ndarray, log: JointLog, kind: str, rng: np.random.Generator):
-    """
-    Parameter sets (J, P) with a change.
-
-    Returns:
-        changed sets, (name, joint or None) of the entries that must be named, description.
-
-    """
+    """Changed sets (J, P), (name, joint or None) of what must be named, and a description."""
     sets, count = sets.copy(), len(sets)
     name, joints = KINDS[kind], rng.permutation(count)
 
@@ -169,7 +162,7 @@ def table(made: list[dict], seed: int) -> Table:
     return shown
 
 
-def main() -> int:
+def main() -> None:
     """Run as a script; see the module's text."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -179,13 +172,11 @@ def main() -> int:
     parser.add_argument('--seed', type=int, default=0)
     given = parser.parse_args()
     if not given.logs:
-        print(f'{DATA}: no joint_*.csv; name logs with --logs', file=sys.stderr)
-        return 2
+        parser.error(f'{DATA}: no joint_*.csv; name logs with --logs')
     console = Console()
     made = run([read_joint_log(path) for path in given.logs], given.cases, given.seed, console)
     console.print(table(made, given.seed))
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -61,12 +61,7 @@ def slower_servo(robot, part):
     return {'joint_bandwidth': {'kp': tuple(kp * part ** 2), 'kd': tuple(kd * part)}}
 
 
-def slower_rotor(robot, ms):
-    """Lag of the rotors, later by a time."""
-    return {'rotor_lag': {'time_constant': robot.rotors.time_constant + ms / 1e3}}
-
-
-def other_thrust(robot, scale):
+def thrust(robot, scale):
     """Thrust of all rotors for a command."""
     return {'thrust_coefficient': {'scale': scale}}
 
@@ -78,9 +73,10 @@ QUANTITIES = {
     'delay of the joints [ms]': (delayed('joint_feedback_delay'), 0.0, 128.0, 4.0),
     'delay of the MoCap [ms]': (delayed('mocap_time_offset'), 0.0, 128.0, 4.0),
     'servo bandwidth [1]': (slower_servo, 1.0, 0.2, 0.05),
-    'lag of the rotors [ms]': (slower_rotor, 0.0, 192.0, 6.0),
-    'more thrust [1]': (other_thrust, 1.0, 2.0, 0.07),
-    'less thrust [1]': (other_thrust, 1.0, 0.36, 0.04)}
+    'lag of the rotors [ms]': (lambda robot, ms: {'rotor_lag': {
+        'time_constant': robot.rotors.time_constant + ms / 1e3}}, 0.0, 192.0, 6.0),
+    'more thrust [1]': (thrust, 1.0, 2.0, 0.07),
+    'less thrust [1]': (thrust, 1.0, 0.36, 0.04)}
 
 
 def flown(controller, plant, effects):

@@ -14,6 +14,7 @@ while other programs use shared caches.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import replace
 import os
 from pathlib import Path
@@ -35,29 +36,24 @@ from beetle_omni_ros.model.schema import ParameterError
 TARGETS = {'median': 0.1, 'p99': 0.2}   # [ms] of inference
 
 
-class TimedNetwork:
-    """The network of a policy, with the CPU ``times`` [s] of its calls."""
-
-    def __init__(self, network):
-        self._network = network
-        self.times: list[float] = []
-
-    def __call__(self, observation):
-        """Action of an observation."""
+def timed(network: Callable, times: list[float]) -> Callable:
+    """A network that adds the CPU time of each call [s] to ``times``."""
+    def act(observation):
         began = thread_time()
-        action = self._network(observation)
-        self.times.append(thread_time() - began)
+        action = network(observation)
+        times.append(thread_time() - began)
         return action
+    return act
 
 
 def measure(policy: PolicyController, robot: RobotParameters, poses: int, seed: int) -> dict:
     """Fly; return the CPU times [ms] of the steps of each controller and of inference."""
-    recorder = LogRecorder()
-    policy.network = network = TimedNetwork(policy.network)
+    recorder, times = LogRecorder(), list[float]()
+    policy.network = timed(policy.network, times)
     flight = FlightLoop(robot, robot, {'nmpc': NmpcController(robot), 'rl': policy}, recorder,
                         seed=seed)
     flight.fly(make_task(f'random{poses}', seed))
-    used = 1e3 * np.array(network.times)
+    used = 1e3 * np.array(times)
     median, p99 = np.percentile(used, [50, 99])
     return {**{f'{name}: step': found for name, found in recorder.log().compute.items()},
             'rl: inference': {'count': len(used), 'median': median, 'p99': p99,
@@ -80,8 +76,7 @@ def main():
     try:
         policy = PolicyController(robot, parameters)
     except ParameterError as error:
-        print(f'benchmarks/policy.py: error: {error}', file=sys.stderr)
-        sys.exit(2)
+        parser.error(str(error))
     table = Table('', 'steps', 'median', 'p99', 'max', title=f'{policy.contract.name}, '
                   f'{policy.contract.observation_size} inputs, {parameters.policy}; '
                   f'{given.poses} random poses, seed {given.seed}: CPU [ms]')

@@ -17,7 +17,6 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-import sys
 
 from joblib import delayed, Parallel
 import numpy as np
@@ -154,7 +153,7 @@ def summary(flown: dict[str, np.ndarray]) -> dict[str, float]:
     return counts
 
 
-def main() -> int:
+def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--policy', help='ONNX file; default: the shipped one')
@@ -168,8 +167,7 @@ def main() -> int:
     try:
         contract = PolicyNetwork(path, RobotParameters.load()).contract
     except ParameterError as error:
-        print(error, file=sys.stderr)
-        return 1
+        parser.error(str(error))
     sizes = [min(PART, given.robots - first) for first in range(0, given.robots, PART)]
     seeds = np.random.SeedSequence(given.seed).generate_state(len(sizes))
     parts = Parallel(n_jobs=given.jobs, return_as='generator')(
@@ -185,8 +183,7 @@ def main() -> int:
     for name, value in result.items():
         table.add_row(name, f'{value:.4g}')
     Console().print(table)
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()
