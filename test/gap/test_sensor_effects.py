@@ -140,6 +140,16 @@ def test_tilts_follow_the_servo_model_if_encoders_are_noisy():
     assert rms(after[1][inside]) < 0.05 * rms(before[1][inside])
 
 
+@pytest.mark.parametrize('name', ['base.tilt_delay', 'servo.kd[2]', 'joint_bandwidth.kp'])
+def test_what_moves_the_servo_model_moves_the_body_if_encoders_are_noisy(name):
+    h, made = 1e-3, [model(noisy(0.02)) for _ in range(2)]
+    for each, theta in zip(made, ({}, {name: h}), strict=True):
+        each.settle(theta)      # the tilts of the body are those of the servo model
+    slopes = made[0].linear({}, [name]).slopes[:, PLACE['B'], 0]
+    moved = (made[1].residual({name: h}, 'B')['B'] - made[0].residual({}, 'B')['B']) / h
+    assert rms(moved) > 1e-3 and rms(slopes - moved) < 0.1 * rms(moved)
+
+
 @pytest.mark.parametrize('noise, hidden', [(0.0, set()), (0.003, {4, 5, 6, 7})])
 def test_encoder_noise_hides_joints_in_the_bands_in_which_they_do_not_move(noise, hidden):
     # tilts move below 0.5 Hz, bands 4 to 7 begin at 1 Hz

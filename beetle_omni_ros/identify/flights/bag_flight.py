@@ -17,13 +17,8 @@ import numpy as np
 
 from beetle_omni_ros.identify.flights.body import BodyModel
 from beetle_omni_ros.identify.flights.keys import delays_of, Key, TILT_BUS
-from beetle_omni_ros.identify.flights.servo import (
-    module_load,
-    simulate,
-    undescribed_load,
-    Windows,
-)
-from beetle_omni_ros.identify.flights.signals import Signals
+from beetle_omni_ros.identify.flights.servo import simulate, windows_of
+from beetle_omni_ros.identify.flights.signals import IMU_LAG, Signals
 from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear
 from beetle_omni_ros.identify.recording.bag import COMMAND, Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
@@ -38,6 +33,8 @@ PLACE = {'B': slice(0, 6), 'A': slice(6, 9), 'W': slice(9, 12), 'J': slice(12, 1
 # Time shift of an encoder reading, and of a pose of MoCap, for each second of delay of a sensor.
 SHIFTS = dict.fromkeys(delays_of('imu'), -1.0) | dict.fromkeys(delays_of('encoders'), 1.0)
 POSE_SHIFTS = dict.fromkeys(delays_of('imu'), -1.0) | dict.fromkeys(delays_of('mocap'), 1.0)
+# Keys by which the tilts of a servo model are as late as by the delay of its bus.
+LATE_TILTS = IMU_LAG, 'command_latency.delay', 'joint_command_latency.delay'
 # Parameters with central differences. With one-sided ones, slopes of equivalent delays differ by
 # the second derivative, and a linear fit exploits the difference.
 BOTH_SIDES = 'delay'
@@ -197,13 +194,16 @@ class BagFlight:
 
     def _guided(self, theta, groups):
         """Residual with the tilts of the servo model at ``theta``, where they are of a model."""
-        s = self.signals
-        before, run = s.model_tilts, self._runs.get(frozenset(theta.items()))
+        before, run = self.signals.model_tilts, self._runs.get(frozenset(theta.items()))
         if before is None or run is None:
             return self.residual(theta, groups)
+        return self._with_tilts(before, run, theta, groups)
+
+    def _with_tilts(self, before, run, theta, groups):
+        """Residual at ``theta`` with fast tilts of simulated servos, not those ``before``."""
         self._use_tilts(before, run)
         result = self.residual(theta, groups)
-        s.use_model_tilts(before)
+        self.signals.use_model_tilts(before)
         return result
 
     def _measured(self, theta):
@@ -255,7 +255,22 @@ class BagFlight:
         turning = [name for name in names if 'J' in self.keys[name].groups]
         for name, slope in zip(turning, self._joint_slopes(theta, turning), strict=True):
             slopes[:, PLACE['J'], names.index(name)] = slope
+        if (tilts := self.signals.model_tilts) is not None:
+            for name, slope in self._of_model_tilts(tilts, theta, now['B'], names).items():
+                if name in names:
+                    slopes[:, PLACE['B'], names.index(name)] += slope
         return slopes
+
+    def _of_model_tilts(self, tilts, theta, now, names):
+        """Name -> derivative (M, 6) of forces and torques by what moves tilts of a model."""
+        names = [TILT_BUS, *(name for name in names
+                             if self.keys[name].effect in ('joint_bandwidth', 'servo'))]
+        steps = [self.keys[name].step for name in names]
+        runs = self._servos([{**theta, name: theta.get(name, 0.0) + h}
+                             for name, h in zip(names, steps, strict=True)], theta)
+        slopes = {name: (self._with_tilts(tilts, run, theta, 'B')['B'] - now) / h
+                  for name, run, h in zip(names, runs, steps, strict=True)}
+        return slopes | dict.fromkeys(LATE_TILTS, slopes[TILT_BUS])
 
     def _of_pose_shift(self, theta):
         """
@@ -364,8 +379,8 @@ class BagFlight:
                          for side in (1, -1) for name, h in zip(moved, sizes, strict=True))]
         runs = self._servos(sets, theta)
         ahead, behind = runs[1:].reshape(2, len(moved), *runs[0].shape)
-        sizes = np.array(sizes).reshape(-1, 1, 1, 1)
-        changes, slopes = dict(zip(moved, (behind - ahead) / (2 * sizes), strict=True)), {}
+        slopes, changes = {}, dict(zip(moved, (behind - ahead) / (
+            2 * np.reshape(sizes, (-1, 1, 1, 1))), strict=True))
         for name, change in changes.items():
             slope = changes[TILT_BUS] * SHIFTS.get(name, 0.0) + change
             slopes[name] = self._of_joints(slope.reshape(-1, 4))
@@ -377,19 +392,5 @@ class BagFlight:
         """Windows of the servos and the edges of their steps; the last ones are kept."""
         timing = {name: theta.get(name, 0.0) for name in SHIFTS}
         if self._kept[0] != timing:
-            self._kept = timing, self._make_windows(timing)
+            self._kept = timing, windows_of(self.signals, self._starts, timing)
         return self._kept[1]
-
-    def _make_windows(self, theta):
-        p, s = self.p, self.signals
-        skip, count = round(p.servo_warm_up / p.servo_step), round(p.servo_window / p.servo_step)
-        begins = s.t[self._starts] - skip * p.servo_step
-        edges = begins[:, None] + p.servo_step * np.arange(skip + count + 1)
-        tilt, rate, _, _ = s.joints(theta)
-        at = self._starts - round(p.servo_warm_up / p.grid)
-        middle = edges[:, :-1] + p.servo_step / 2
-        index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
-        loads = (s.thrust({})[0], module_load(s, theta), *undescribed_load(s, theta))
-        force, load, *more = (series[index].transpose(1, 0, 2) for series in loads)
-        return Windows(tilt[at], rate[at], force, load, p.servo_step, skip,
-                       round(p.grid / p.servo_step), tuple(more)), edges

@@ -116,19 +116,16 @@ class Engine(Linearised):
             value = weight(chosen)
             if value > top:
                 best, top = chosen, value
-        first, visited = best, {best}       # pairwise gains need not be transitive
-        while True:
+        visited: list[tuple[int, ...]] = []     # pairwise gains need not be transitive: the
+        while best not in visited:              # next set must be better than all before it
+            visited.append(best)
             near = {tuple(sorted(set(best) - out | more))
                     for out in [set(), *({k} for k in best)]
                     for more in [set(), *({k} for k in allowed if k not in best)]}
-            gain, chosen = max(((self.gain(judge, c, best), c) for c in near - visited
-                                if len(c) <= MOST), default=(0.0, best))
-            if gain <= 0:
-                break
-            best = chosen
-            visited.add(best)
-        if self.gain(judge, first, best) > 0:
-            best = first
+            better = sorted(((self.gain(judge, c, best), c) for c in near - {best}
+                             if len(c) <= MOST), reverse=True)
+            best = next((c for gain, c in better if gain > 0 and all(
+                self.gain(judge, c, old) > 0 for old in visited)), best)
         weight(best)
         weight(tuple(k for k in best if self.entries[k].varying))
         posterior = judge.posterior(self.indices(best))

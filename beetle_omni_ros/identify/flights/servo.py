@@ -49,6 +49,29 @@ class Windows:
     undescribed: tuple[np.ndarray, ...] = ()
 
 
+def windows_of(signals: Signals, starts: np.ndarray, theta: dict[str, float]
+               ) -> tuple[Windows, np.ndarray]:
+    """
+    Windows that begin to count at ``starts`` (W,) of the grid, with timing and loads at ``theta``.
+
+    Returns:
+        the windows, and the times (W, K + 1) of the edges of their steps [s].
+
+    """
+    s, p = signals, signals.p
+    skip, count = round(p.servo_warm_up / p.servo_step), round(p.servo_window / p.servo_step)
+    edges = (s.t[starts] - skip * p.servo_step)[:, None] \
+        + p.servo_step * np.arange(skip + count + 1)
+    tilt, rate, _, _ = s.joints(theta)
+    at = starts - round(p.servo_warm_up / p.grid)
+    middle = edges[:, :-1] + p.servo_step / 2
+    index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
+    loads = (s.thrust({})[0], module_load(s, theta), *undescribed_load(s, theta))
+    force, load, *more = (series[index].transpose(1, 0, 2) for series in loads)
+    return Windows(tilt[at], rate[at], force, load, p.servo_step, skip,
+                   round(p.grid / p.servo_step), tuple(more)), edges
+
+
 def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray, which: np.ndarray,
              sets: list[dict[str, float]], modules: float) -> np.ndarray:
     """
