@@ -1,7 +1,7 @@
 """
 Speed of environment, rollout and update in training, compared with the loop of rsl-rl.
 
-    python benchmarks/environment.py [--device cuda] [--robots 4096,16384] [--json FILE]
+    python benchmarks/environment.py [--device cuda]
 
 On a GPU the environment's steps, the rollout and the update run as captured graphs. Rollout and
 update of rsl-rl are its own functions on the same robots, networks and samples; its rollout steps
@@ -13,14 +13,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
-import json
-from pathlib import Path
 import statistics
 import sys
 import time
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 from rsl_rl.algorithms import PPO
 import torch
 
@@ -31,7 +29,7 @@ from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.runner import choose_device, Runner
 
 TARGET = 10e6                  # environment steps a second, on a GPU
-GPU_ROBOTS, CPU_ROBOTS = '4096,16384', '64,1024'
+GPU_ROBOTS, CPU_ROBOTS = (4096, 16384), (64, 1024)
 CPU_PPO_ROBOTS = 64            # of rollout and update on a CPU
 GRAPH_STEPS = 100              # of the environment in one captured graph
 ROBOT = RobotParameters.load()
@@ -108,56 +106,37 @@ def rsl_rls(robots: int, device: str) -> dict[str, float]:
             'update': seconds(lambda: PPO.update(alg), device, 3)}
 
 
-def show(results: dict, console: Console) -> None:
-    """Print what was measured."""
-    console.print(f"{results['device']}, torch {results['torch']}")
-    for robots, rate in results['environment'].items():
-        console.print(f'environment, {robots} robots: {rate / 1e6:.3g} million steps/s')
-    table = Table(title=f"one iteration, {results['robots']} robots x {results['steps']} steps "
-                        '[ms]')
-    for column in ('', 'rollout', 'update', 'both', 'samples/s'):
-        table.add_column(column, justify='right' if column else 'left')
-    for name in ('ours', 'rsl_rl'):
-        rollout, update = results[name]['rollout'], results[name]['update']
-        samples = results['robots'] * results['steps'] / (rollout + update)
-        table.add_row(name.replace('_', '-'), *(f'{1e3 * value:.1f}' for value in (
-            rollout, update, rollout + update)), f'{samples:.2e}')
-    console.print(table)
-
-
 def main():
     """Measure and print; status 1 if the environment misses its target on a GPU."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--device', default='auto')
-    parser.add_argument('--robots', help='sizes of the environment')
-    parser.add_argument('--json', type=Path, help='file for the numbers')
-    given = parser.parse_args()
     try:
-        device = choose_device(given.device)
-        gpu = device.startswith('cuda')
-        sizes = [int(size) for size in (given.robots or (GPU_ROBOTS if gpu else CPU_ROBOTS)
-                                        ).split(',')]
-    except (ParameterError, ValueError) as error:
-        print(f'benchmarks/environment.py: error: {error}', file=sys.stderr)
-        sys.exit(2)
+        device = choose_device(parser.parse_args().device)
+    except ParameterError as error:
+        parser.error(str(error))
+    gpu = device.startswith('cuda')
     torch.set_float32_matmul_precision('high')
     if not gpu:
         torch.set_num_threads(1)    # several threads wait for each other on a shared computer
+    print(f"{torch.cuda.get_device_name(device) if gpu else 'CPU, one thread'}, "
+          f'torch {torch.__version__}')
+    missed = False
+    for size in GPU_ROBOTS if gpu else CPU_ROBOTS:
+        rate = environment_rate(size, device)
+        missed = missed or gpu and rate < TARGET
+        print(f'environment, {size} robots: {rate / 1e6:.3g} million steps/s'
+              + f', required {TARGET / 1e6:g}' * gpu)
     ppo = TrainParameters.load().ppo
     robots = ppo.robots if gpu else CPU_PPO_ROBOTS
-    results = {'device': torch.cuda.get_device_name(device) if gpu else 'CPU, one thread',
-               'torch': torch.__version__,
-               'environment': {size: environment_rate(size, device) for size in sizes},
-               'robots': robots, 'steps': ppo.steps, 'ours': ours(robots, device),
-               'rsl_rl': rsl_rls(robots, device)}
-    show(results, Console(width=100))
-    if given.json:
-        given.json.write_text(json.dumps(results, indent=1) + '\n')
-    met = all(rate >= TARGET for rate in results['environment'].values())
-    if gpu:
-        print(f'target of the environment: {TARGET / 1e6:g} million steps/s: '
-              + ('met' if met else 'missed'))
-    sys.exit(1 if gpu and not met else 0)
+    table = Table('', *(Column(name, justify='right') for name in (
+        'rollout', 'update', 'both', 'samples/s')),
+        title=f'one iteration, {robots} robots x {ppo.steps} steps [ms]')
+    for name, measured in (('ours', ours), ('rsl-rl', rsl_rls)):
+        rollout, update = measured(robots, device).values()
+        table.add_row(name, *(f'{1e3 * value:.1f}' for value in (
+            rollout, update, rollout + update)), f'{robots * ppo.steps / (rollout + update):.2e}')
+    Console(width=100).print(table)
+    sys.exit(missed)
 
 
 if __name__ == '__main__':

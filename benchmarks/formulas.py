@@ -13,8 +13,6 @@ import argparse
 from collections import namedtuple
 from contextlib import closing
 from dataclasses import replace
-import importlib.util
-import json
 from pathlib import Path
 import tempfile
 from time import process_time
@@ -31,16 +29,16 @@ from beetle_omni_ros.identify.flights import bag_flight, body, command, page, tr
 from beetle_omni_ros.identify.flights.keys import all_keys, ARM, extra_keys, LIMITS
 from beetle_omni_ros.identify.recording import bag, flight, parameters
 from beetle_omni_ros.model import dynamics, effects, formula, terms
+from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import RobotParameters
 
 LIKE, CLOSED = 0.95, 0.8    # least correlation and closure of a law that is rediscovered
 LOW = 0.3                   # [m] the flight above counts
 GAP = parameters.GapParameters.load()
 UNDISTURBED, TRIES = 'undisturbed', 5   # draws of an effect until no flight is lost
-WIDTHS = {'position': 3, 'velocity': 3, 'quaternion': 4, 'angular_velocity': 3, 'tilt': 4,
-          'tilt_rate': 4, 'thrust': 4, 'voltage_ratio': 1, 'tilt_acceleration': 4,
-          'thrust_rate': 4}
 X, Y, Z = (ca.DM(row) for row in np.eye(3))
+STATES = ('position', 'velocity', 'quaternion', 'angular_velocity', 'tilt', 'tilt_velocity',
+          'thrust', 'stamp')     # true ones
 Case = namedtuple('Case', 'name key cost kind effect number seed baseline')
 
 
@@ -127,48 +125,45 @@ def fly(controller, robot, plant, seed, path):
     simulator = loop.simulator
 
     def note():
-        true = simulator.truth
-        rows.append(np.hstack([
-            true.position, true.velocity, true.quaternion, true.angular_velocity, true.tilt,
-            true.tilt_velocity, true.thrust / plant.thrust_scale,
-            simulator.battery.voltage / plant.battery.full_voltage, true.stamp]))
+        rows.append([*(np.array(getattr(simulator.truth, name)) for name in STATES),
+                     simulator.battery.voltage])
     loop.before_messages = note
     with closing(loop):
         if not loop.fly(make_task('random5', seed)):
             return None
         sent = loop.recording().command
-    *states, t = np.split(np.array(rows), np.cumsum(list(WIDTHS.values())[:8]), axis=1)
-    made, step, t = dict(zip(WIDTHS, states, strict=False)), simulator.tick, t[:, 0]
-    rows = sorted((row.voltage, row.thrust_max) for row in robot.rotors.map)
-    most = np.interp(made['voltage_ratio'] * robot.battery.full_voltage, *zip(*rows, strict=True))
-    made |= {name: np.gradient(made[of], step, axis=0) for name, of in (
-        ('tilt_acceleration', 'tilt_rate'), ('thrust_rate', 'thrust'))}
+    *states, tilt_rate, real, t, voltage = map(np.array, zip(*rows, strict=True))
+    ratio, step, high = voltage / plant.battery.full_voltage, simulator.tick, states[0][:, 2] > LOW
+    points = sorted((row.voltage, row.thrust_max) for row in robot.rotors.map)
+    most = np.interp(ratio * robot.battery.full_voltage, *zip(*points, strict=True))
 
     def flown(other=None):
         """States, name -> (N, width); the thrusts are answers to the recorded commands."""
-        more = {}
+        thrust = real / plant.thrust_scale
+        thrust_rate = np.gradient(thrust, step, axis=0)
         if other:
-            rotors = other.rotors
-            late = GAP.command_delay + other.command_delays[1]
+            rotors, late = other.rotors, GAP.command_delay + other.command_delays[1]
             at = np.searchsorted(sent.t + late, t + 1e-5, side='right') - 1
             aim = np.clip(sent.thrust[np.maximum(at, 0)], rotors.thrust_min, np.minimum(
-                rotors.thrust_max, most))
+                rotors.thrust_max, most[:, None]))
             gain = -np.expm1(-step / rotors.time_constant)
             thrust = lfilter([0, gain], [1, gain - 1], aim, axis=0)
-            more = {'thrust': thrust, 'thrust_rate': (aim - thrust) / rotors.time_constant}
-        return {name: values[made['position'][:, 2] > LOW] for name, values in (
-            made | more).items()}
+            thrust_rate = (aim - thrust) / rotors.time_constant
+        made = dict(zip(STATES, states, strict=False)) | {
+            'tilt_rate': tilt_rate, 'tilt_acceleration': np.gradient(tilt_rate, step, axis=0),
+            'thrust': thrust, 'thrust_rate': thrust_rate, 'voltage_ratio': ratio[:, None]}
+        return {name: values[high] for name, values in made.items()}
     return flown
 
 
 def wrench(robot, base, states):
     """(N, 6) force and torque over arm [N] in base_link of a robot file."""
-    x = {name: ca.SX.sym(name, width) for name, width in WIDTHS.items()}
+    x = {name: ca.SX.sym(name, values.shape[1]) for name, values in states.items()}
     acceleration, turning = dynamics.rigid_body(robot, **x)
     made = ca.Function('wrench', list(x.values()), [ca.vertcat(
         base.mass * dynamics.rotation_matrix(x['quaternion']).T @ acceleration,
         ca.DM(base.inertia) * turning / ARM)])
-    return np.array(made.map(len(states['thrust']))(*(states[name].T for name in x))).T
+    return np.array(made.map(len(states['thrust']))(*(values.T for values in states.values()))).T
 
 
 def correlation(true, found):
@@ -206,23 +201,24 @@ def sparse(paths, robot):
 
 def examined(case):
     """What `gap --learn` finds of the flights of a case, and how true it is."""
-    began, base = process_time(), RobotParameters.load()
-    if case.effect == 'module_reaction':    # else the plant has modules
-        base = replace(base, multibody=None)
     # Of the module, because a worker has a copy of globals. Without a treatment no fit has them.
     effects.CATALOGUE.update({name: family(name) for name in KINDS['outside']})
-    row = {'case': case.name, 'kind': case.kind, 'controller': ('nmpc', 'rl')[case.number % 2]}
+    began, controller = process_time(), ('nmpc', 'rl')[case.number % 2]
     try:
         with tempfile.TemporaryDirectory() as folder:
-            row |= compared(case, row['controller'], base, Path(folder))
+            row = compared(case, controller, Path(folder))
     except Exception as error:      # of one case; the others continue
-        row['failure'] = f'{type(error).__name__}: {error}'
-    return row | {'cpu_s': round(process_time() - began, 1)}
+        row = {'failure': f'{type(error).__name__}: {error}'}
+    return {'case': case.name, 'kind': case.kind, 'controller': controller, **row,
+            'cpu_s': round(process_time() - began, 1)}
 
 
-def compared(case, controller, base, folder):
+def compared(case, controller, folder):
     """Answers about three flights of a plant, and their correlations with the true force."""
     rng = np.random.default_rng([case.seed, list(KINDS).index(case.kind), case.number])
+    base = RobotParameters.load()
+    if case.effect == 'module_reaction':    # else the plant has modules
+        base = replace(base, multibody=None)
     for lost in range(TRIES):
         truth = {} if case.kind == UNDISTURBED else {case.effect: drawn(case.effect, base, rng)}
         plant, paths = replace(base, effects=truth), [folder / f'{lost}_{i}' for i in range(3)]
@@ -236,19 +232,19 @@ def compared(case, controller, base, folder):
     without.write_text(f"without: [{case.effect * (case.kind == 'left_out')}]\n")
     result = command.gap_results(paths[:2], paths[2:], robot, corrected, parameters=without,
                                  learn=folder / 'effect.yaml', console=Console(quiet=True))
-    laws = {'': {}, '_baseline': sparse(paths[:2], base) if case.baseline else {}}
-    for effect in result['effects']:
-        if 'expressions' in effect:
-            laws[''] = {term: k['value'] for term, k in effect['parameters'].items()}
+    named = [page.label(each) for each in result['effects'] if 'expressions' not in each]
+    laws = {'': {term: k['value'] for each in result['effects'] if 'expressions' in each
+                 for term, k in each['parameters'].items()},
+            '_baseline': sparse(paths[:2], base) if case.baseline else {}}
     answers = {which: with_formula(base, law) for which, law in laws.items()} | {
         '_all': RobotParameters.load(corrected) if result['effects'] else base}
     before = wrench(base, base, flown(base))
     true = wrench(plant, base, flown()) - before
+    of_formula = result['formula']
     return {'truth': truth, 'lost': lost, 'force_N': float(np.sqrt((true**2).sum(1).mean())),
-            'named': [page.label(each) for each in result['effects'] if 'expressions' not in each],
-            **{key: result[key] for key in ('verdict', 'closure')},
-            'closure_of_formula': result['formula'].get('closure'),
-            **{key: result['formula'].get(key) for key in ('reason', 'ln_bayes_factor')},
+            'named': named, 'verdict': result['verdict'], 'closure': result['closure'],
+            'closure_of_formula': of_formula.get('closure'), 'reason': of_formula.get('reason'),
+            'ln_bayes_factor': of_formula.get('ln_bayes_factor'),
             **{f'formula{which}': law for which, law in laws.items()},
             **{f'correlation{which}': correlation(true, wrench(
                 other, base, flown(other)) - before) for which, other in answers.items()}}
@@ -274,9 +270,8 @@ def summary(rows):
     own = [row for row in rows if 'failure' not in row]
     laws = [row for row in own if row['formula']]
     return {'cases': len(rows), 'failures': len(rows) - len(own), 'formulas': len(laws),
-            **{f'rediscovered{which}': sum(bool(
-                row[f'correlation{which}'] >= LIKE and row['closure'] >= CLOSED)
-                for row in laws) for which in ('', '_all')},
+            'rediscovered': sum(bool(row['correlation'] >= LIKE and row['closure'] >= CLOSED)
+                                for row in laws),
             'named_without_formula': sum(bool(row['named']) for row in own if row not in laws),
             'baseline_formulas': sum(bool(row['formula_baseline']) for row in own),
             'baseline_correlated': sum(row['correlation_baseline'] >= LIKE for row in own)}
@@ -293,15 +288,13 @@ def main():
     parser.add_argument('--out', type=Path, default=Path('runs_out/formulas.json'),
                         help='results; finished cases are kept in a folder beside it')
     given = parser.parse_args()
-    if given.baseline and importlib.util.find_spec('pysindy') is None:
-        parser.error('--baseline: expected the package pysindy, found none')
     code = digest(*(path.read_bytes() for path in (
         Path(__file__), *sorted(SOURCE.rglob('*.py')))))
-    cases = [(kind, names[k % len(names)], k, given.seed, given.baseline)
+    cases = [Case(f'{kind} {names[k % len(names)]} {k}', code, 1, kind, names[k % len(names)], k,
+                  given.seed, given.baseline)
              for kind, names in KINDS.items() if given.only in (None, kind)
              for k in range(given.cases or (50 if kind == UNDISTURBED else len(names)))]
-    calls = [(Case(' '.join(map(str, case[:3])), digest(code, repr(case)), 1, *case),)
-             for case in cases]
+    calls = [(case._replace(key=digest(repr(case))),) for case in cases]
     console = Console(width=250)
     console.print(f'{"case":42} by    force [N], correlation of the formula, with the entries '
                   'named beside it, closure, ln B, these entries | formula')
@@ -309,9 +302,8 @@ def main():
                  console=console, line=line)
     counts = {kind: summary(own) for kind in KINDS if (
         own := [row for row in rows if row['kind'] == kind])}
-    given.out.write_text(json.dumps({'seed': given.seed, 'summary': counts, 'cases': rows},
-                                    indent=1))
-    console.print_json(json.dumps(counts))
+    write_json(given.out, {'seed': given.seed, 'summary': counts, 'cases': rows})
+    console.print_json(data=counts)
 
 
 if __name__ == '__main__':

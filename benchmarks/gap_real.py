@@ -1,7 +1,7 @@
 """
 `gap --format` on real flights: what it names, and whether disjoint halves agree.
 
-    .venv/bin/python benchmarks/gap_real.py FOLDER [--crazypad] [--json FILE]
+    .venv/bin/python benchmarks/gap_real.py FOLDER [--crazypad]
 
 FOLDER has the flights of NanoBench in the columns of `params/formats/nanobench.yaml`, and
 `labels.csv` with the columns file and vehicle. The flights of one build are divided into two
@@ -17,7 +17,6 @@ the cause. A normal flight has none, and a load is a mass and moves the centre o
 import argparse
 import csv
 from itertools import combinations, groupby
-import json
 from pathlib import Path
 import tempfile
 
@@ -57,7 +56,6 @@ def analysed(case, fitted, judging, robot, apply=None):
                          console=Console(quiet=True))
     print(f"| {case} | {result['verdict']} | {sizes(result['effects'] or result['partial'])} | "
           f"{result['gap_before']:.2f} | {result['gap_after']:.2f} |", flush=True)
-    return {'case': case, **result}
 
 
 def nanobench(folder):
@@ -73,15 +71,15 @@ def nanobench(folder):
             return path
 
         corrected, bare = Path(temporary, 'corrected.yaml'), robot('bare', {})
-        rows = [analysed('literature, half 1', one, two, ROBOT, corrected),
-                analysed('literature, half 2', two, one, ROBOT),
-                analysed('without voltage, half 1', one, two, bare),
-                analysed('without voltage, half 2', two, one, bare)]
+        analysed('literature, half 1', one, two, ROBOT, corrected)
+        analysed('literature, half 2', two, one, ROBOT)
+        analysed('without voltage, half 1', one, two, bare)
+        analysed('without voltage, half 2', two, one, bare)
         effects = yaml.safe_load(corrected.read_text())['effects']
-        rows += [analysed(f'corrected by half 1 without {name}, half 2', two, one, robot(
-            name, {other: values for other, values in effects.items() if other != name}))
-            for name in effects]
-        return [*rows, analysed('corrected by half 1, half 2', two, one, corrected)]
+        for name in effects:
+            analysed(f'corrected by half 1 without {name}, half 2', two, one, robot(
+                name, {other: values for other, values in effects.items() if other != name}))
+        analysed('corrected by half 1, half 2', two, one, corrected)
 
 
 def holding(cause):
@@ -99,7 +97,6 @@ def crazypad(folder):
                      for row in labels(folder) if row['file'].startswith('pad_motor'))
     print('| cause | flights | reference | verdict | effects, 95 % | probability | |')
     print('| --- | --- | --- | --- | --- | --- | --- |')
-    rows = []
     with tempfile.TemporaryDirectory() as temporary:
         robots = {'': ROBOT} | {
             f'{vehicle} {path.name}': centred(path, Path(temporary, f'{path.stem}.yaml'))
@@ -109,8 +106,8 @@ def crazypad(folder):
             sets = [(chosen, '') for size in (1, 2, 3) for chosen in combinations(paths, size)]
             sets += [((path,), name) for path in paths for name in robots if name.startswith(
                 vehicle) and not name.endswith(path.name)]
-            rows += [weighed(vehicle, cause, chosen, robots[name], name) for chosen, name in sets]
-    return rows
+            for chosen, name in sets:
+                weighed(vehicle, cause, chosen, robots[name], name)
 
 
 def centred(path, to):
@@ -134,20 +131,15 @@ def weighed(vehicle, cause, paths, robot, reference):
         set(effect['members']) & right for effect in effects) else 'wrong'
     print(f"| {cause} {vehicle[-2:]} | {len(paths)} | {reference} | {result['verdict']} | "
           f"{sizes(effects)} | {result['false_alarm_probability']:.2g} | {score} |", flush=True)
-    return {'vehicle': vehicle, 'cause': cause, 'flights': [path.name for path in paths],
-            'reference': reference, 'score': score, **result}
 
 
 def main():
     """Run all cases and print a row for each."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0])
     parser.add_argument('folder', type=Path)
-    parser.add_argument('--json', type=Path)
     parser.add_argument('--crazypad', action='store_true')
     given = parser.parse_args()
-    rows = (crazypad if given.crazypad else nanobench)(given.folder)
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=1))
+    (crazypad if given.crazypad else nanobench)(given.folder)
 
 
 if __name__ == '__main__':

@@ -128,22 +128,17 @@ def main():
     """Measure the arrangements and print a table."""
     arguments = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     arguments.add_argument('--seconds', type=float, default=24, help='flight time of each')
-    arguments.add_argument('--json', type=Path, help='file for the numbers')
     arguments.add_argument('--bare-timer', action='store_true', help=argparse.SUPPRESS)
     given = arguments.parse_args()
     if given.bare_timer:
         return sleep_on()
-    table = Table('', *ARRANGEMENTS)
-    measured = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name in ARRANGEMENTS:
-            measured[name] = measure(Path(folder), name, given.seconds)
+        measured = [measure(Path(folder), name, given.seconds) for name in ARRANGEMENTS]
+    table = Table('', *ARRANGEMENTS)
     for key, text in ROWS.items():
-        table.add_row(text, *(_cell(measured[name].get(key), targets.get(key))
-                              for name, targets in ARRANGEMENTS.items()))
+        table.add_row(text, *(_cell(found.get(key), targets.get(key))
+                              for found, targets in zip(measured, ARRANGEMENTS.values())))
     Console().print(table)
-    if given.json:
-        given.json.write_text(json.dumps(measured, indent=1) + '\n')
 
 
 def _cell(value, target):

@@ -1,7 +1,7 @@
 """
 Detection of servo changes by `beetle_omni gap LOG.csv`, and false detections.
 
-`python benchmarks/joint_gap.py --cases 48 --seed 1 --json joint_gap.json`. The servos of each real
+`python benchmarks/joint_gap.py --cases 48 --seed 1`. The servos of each real
 log are identified. Each case is an artificial log: a simulation of the identified servos with one
 change, plus the residual of the real log, rounded to encoder counts. The residual is used
 unchanged, circularly shifted, or in blocks of a second drawn at random. The log is compared with
@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-import json
 from pathlib import Path
-import sys
 import time
 from unittest.mock import patch
 
@@ -22,7 +20,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.servo import compare as servo_compare
 from beetle_omni_ros.identify.servo.compare import compare, gap_of
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
@@ -43,21 +40,12 @@ KINDS = {'nothing': None, 'zero': 'joint_offset', 'two zeros': 'joint_offset',
 
 
 def changed(sets: np.ndarray, log: JointLog, kind: str, rng: np.random.Generator):
-    """
-    Parameter sets (J, P) with a change.
-
-    Returns:
-        changed sets, (name, joint or None) of the entries that must be named, description.
-
-    """
+    """Changed sets (J, P), (name, joint or None) of what must be named, and a description."""
     sets, count = sets.copy(), len(sets)
     name, joints = KINDS[kind], rng.permutation(count)
 
     def sized(low, high):
         return float(rng.uniform(low, high) * rng.choice([-1, 1]))
-
-    def moved(term, by, which):
-        sets[which, INDEX[term]] += by
 
     if kind == 'nothing':
         return sets, set(), ''
@@ -68,7 +56,7 @@ def changed(sets: np.ndarray, log: JointLog, kind: str, rng: np.random.Generator
             by = sized(*SIZE)
             if kind == 'encoder gain':
                 by /= np.abs(log.measured[j]).max()
-            moved('encoder_gain' if kind == 'encoder gain' else 'offset', by, j)
+            sets[j, INDEX['encoder_gain' if kind == 'encoder gain' else 'offset']] += by
             words.append(f'joint {log.joints[j]} {by:+.4f}')
         return sets, {(name, log.joints[j]) for j in joints}, ', '.join(words)
     which = slice(None) if kind == 'delay' or rng.random() < 0.5 else joints[:1]
@@ -81,14 +69,14 @@ def changed(sets: np.ndarray, log: JointLog, kind: str, rng: np.random.Generator
     elif kind == 'delay':
         by = sized(0.008, 0.020)
         by = by if sets[:, INDEX['delay']].min() + by >= 0 else -by
-        moved('delay', by, which)
+        sets[which, INDEX['delay']] += by
         words = f'{1e3 * by:+.1f} ms'
     else:
         term = 'coulomb_friction' if kind == 'friction' else 'backlash'
         by = float(rng.uniform(*SIZE))
         if rng.random() < 0.5 and sets[which, INDEX[term]].min() > by:
             by = -by
-        moved(term, by, which)
+        sets[which, INDEX[term]] += by
         words = f'{1e3 * by:+.1f} mrad'
     return sets, {(name, None)}, words + (
         '' if which == slice(None) else f', joint {log.joints[joints[0]]}')
@@ -136,25 +124,10 @@ def scored(made: dict, wanted: set) -> dict:
             'verdict': made['verdict']}
 
 
-def own_correction(log: JointLog, robot: RobotParameters) -> dict:
-    """Verdicts of a log against the shipped file, and against its correction by that."""
-    found = identify([log], robot)
-    first = gap_of(compare(log, robot), found, robot)
-    second = robot_with(robot, effects_with(robot, first['effects']))     # as --apply writes
-    again = gap_of(compare(log, second), identify([log], second), second)
-    return {'verdict': first['verdict'], 'names': [e['names'] for e in first['effects']],
-            'reason': first['reason'], 'verdict_corrected': again['verdict'],
-            'names_corrected': [e['names'] for e in [*again['effects'], *again['partial']]],
-            'reason_corrected': again['reason']}
-
-
-def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> dict:
-    """Results of real logs with their own correction, and of ``cases`` artificial logs."""
-    robot, rows, real, sets = RobotParameters.load(), [], {}, {}
-    for log in logs:
-        real[log.name] = own_correction(log, robot)
-        console.print(f'{log.name}: {real[log.name]}', highlight=False, markup=False)
-        sets[log.name] = identify([log], robot).values()
+def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> list[dict]:
+    """Results of ``cases`` artificial logs."""
+    robot, rows = RobotParameters.load(), []
+    sets = {log.name: identify([log], robot).values() for log in logs}
     for k in range(cases):
         rng = np.random.default_rng([seed, k])
         kind, log = list(KINDS)[k % len(KINDS)], logs[k // len(KINDS) % len(logs)]
@@ -162,29 +135,22 @@ def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> di
         after, wanted, words = changed(before, log, kind, rng)
         begin, way = time.process_time(), WAYS[rng.integers(3)]
         made = judged(made_log(log, before, after, way, rng), before, robot)
-        row = {'kind': kind, 'case': k, 'log': log.name, 'change': words, 'residual': way,
-               **scored(made, wanted), 'reason': made['reason'],
-               'effects': [[e['names'], e.get('joint'), {
-                   key: e['parameters'][key].get('each', e['parameters'][key]['value'])
-                   for key in e['parameters']}] for e in [*made['effects'], *made['partial']]],
-               'gains': {c['name']: [c['evidence']['ln_bayes_factor'], c['evidence']['cv_gain'],
-                                     c['evidence']['blocks_positive']]
-                         for c in made['candidates']},
-               'seconds': time.process_time() - begin}
+        row = {'kind': kind, **scored(made, wanted), 'seconds': time.process_time() - begin}
         rows.append(row)
+        effects = [[e['names'], e.get('joint')] for e in [*made['effects'], *made['partial']]]
         mark = '' if row['named'] and not row['wrong'] else '  <-'
         console.print(f"{k} {log.name} {kind} {words} ({way}): {row['verdict']} "
-                      f"{[e[:2] for e in row['effects']]}{mark}",
+                      f'{effects}{mark}',
                       highlight=False, markup=False, soft_wrap=True)
-    return {'seed': seed, 'real': real, 'cases': rows}
+    return rows
 
 
-def table(made: dict) -> Table:
+def table(made: list[dict], seed: int) -> Table:
     """Counts by kind of change."""
     shown = Table('change', 'logs', 'named', 'alone', 'wrong names', 'no gap', 'unknown', 'CPU s',
-                  title=f"Joint logs, seed {made['seed']}")
+                  title=f'Joint logs, seed {seed}')
     for kind in [*KINDS, None]:
-        rows = [row for row in made['cases'] if kind in (row['kind'], None)
+        rows = [row for row in made if kind in (row['kind'], None)
                 and (kind or row['kind'] != 'nothing')]
         if rows:
             shown.add_row(kind or 'all changes', *(str(x) for x in (
@@ -196,7 +162,7 @@ def table(made: dict) -> Table:
     return shown
 
 
-def main() -> int:
+def main() -> None:
     """Run as a script; see the module's text."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -204,18 +170,13 @@ def main() -> int:
                         help='real joint logs')
     parser.add_argument('--cases', type=int, default=24, help='made logs')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--json', type=Path, help='file for the results')
     given = parser.parse_args()
     if not given.logs:
-        print(f'{DATA}: no joint_*.csv; name logs with --logs', file=sys.stderr)
-        return 2
+        parser.error(f'{DATA}: no joint_*.csv; name logs with --logs')
     console = Console()
     made = run([read_joint_log(path) for path in given.logs], given.cases, given.seed, console)
-    console.print(table(made))
-    if given.json:
-        given.json.write_text(json.dumps(made, indent=1))
-    return 0
+    console.print(table(made, given.seed))
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

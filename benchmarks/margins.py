@@ -9,15 +9,14 @@ change by at most 0.02 rad (RMS) within 10 ms at the target. Bisection gives the
 and the smallest other value. It assumes that every larger value is not tolerated either.
 
 The linear margins are those of level hover, from the Jacobians of controller and robot, without
-the supervisor, the estimator of the state and noise; `--plants ''` flies none. `--policy` is that
-of `rl`. All flights take half an hour of 16 cores.
+the supervisor, the estimator of the state and noise; `--plants ''` flies none. All flights take
+half an hour of 16 cores.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-import json
 from pathlib import Path
 import sys
 from unittest.mock import patch
@@ -33,17 +32,17 @@ from beetle_omni_ros.bags.metrics import metrics
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, PoseTarget, State
 from beetle_omni_ros.control.latency import NoiseFilter
-from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.campaign import workers
 from beetle_omni_ros.flight.evaluate import fly
 from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.model.effects import validated
+from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 
 CHATTER, ANGLE = 0.02, 2.0      # [rad] of the tilt commands in 10 ms, [deg]: tolerated
-PERIOD, HEIGHT = 0.01, 1.0
+PERIOD, HEIGHT, SEED = 0.01, 1.0, 5
 SETTLING, EMPTY, LENGTH = 1000, 40, 300     # steps to the equilibrium, before and after an impulse
 SIZE = 1e-3             # of an impulse [m, m/s, rad, rad/s, N]
 PARTS = 'commands', 'tilts', 'thrusts'
@@ -62,12 +61,7 @@ def slower_servo(robot, part):
     return {'joint_bandwidth': {'kp': tuple(kp * part ** 2), 'kd': tuple(kd * part)}}
 
 
-def slower_rotor(robot, ms):
-    """Lag of the rotors, later by a time."""
-    return {'rotor_lag': {'time_constant': robot.rotors.time_constant + ms / 1e3}}
-
-
-def other_thrust(robot, scale):
+def thrust(robot, scale):
     """Thrust of all rotors for a command."""
     return {'thrust_coefficient': {'scale': scale}}
 
@@ -79,17 +73,19 @@ QUANTITIES = {
     'delay of the joints [ms]': (delayed('joint_feedback_delay'), 0.0, 128.0, 4.0),
     'delay of the MoCap [ms]': (delayed('mocap_time_offset'), 0.0, 128.0, 4.0),
     'servo bandwidth [1]': (slower_servo, 1.0, 0.2, 0.05),
-    'lag of the rotors [ms]': (slower_rotor, 0.0, 192.0, 6.0),
-    'more thrust [1]': (other_thrust, 1.0, 2.0, 0.07),
-    'less thrust [1]': (other_thrust, 1.0, 0.36, 0.04)}
+    'lag of the rotors [ms]': (lambda robot, ms: {'rotor_lag': {
+        'time_constant': robot.rotors.time_constant + ms / 1e3}}, 0.0, 192.0, 6.0),
+    'more thrust [1]': (thrust, 1.0, 2.0, 0.07),
+    'less thrust [1]': (thrust, 1.0, 0.36, 0.04)}
 
 
-def flown(controller, plant, effects, task, seed, options):
+def flown(controller, plant, effects):
     """Reached poses, chatter [rad] and mean U [deg] of a flight, and whether it is tolerated."""
+    task = make_task('random10', SEED)
     true = replace(plant, effects={**plant.effects, **validated(effects)})
     try:
         result = metrics(fly(controller, task, robot=RobotParameters.load(), plant=true,
-                             seed=seed, options=options), task)
+                             seed=SEED), task)
     except RunError as error:       # no take-off
         return {'reached': 0, 'error': str(error), 'tolerated': False}
     reached = sum(pose['reached'] for pose in result['poses'])
@@ -99,16 +95,13 @@ def flown(controller, plant, effects, task, seed, options):
         reached == len(task.poses) and chatter <= CHATTER and angle <= ANGLE)}
 
 
-def margin(controller, plant, quantity, chosen):
+def margin(controller, plant, quantity):
     """Bisect one quantity of one controller on one plant; None if nothing is tolerated."""
     effect, none, most, resolution = QUANTITIES[quantity]
-    robot, task = RobotParameters.load(plant), make_task(chosen.task, chosen.seed)
-    options = {'rl': ControllerOptions(policy=chosen.policy)} if chosen.policy else {}
-    flights = []
+    robot, flights = RobotParameters.load(plant), []
 
     def tolerated(value):
-        flights.append({'value': value, **flown(controller, robot, effect(robot, value), task,
-                                                chosen.seed, options)})
+        flights.append({'value': value, **flown(controller, robot, effect(robot, value))})
         return flights[-1]['tolerated']
 
     good, bad = none, most
@@ -130,11 +123,6 @@ def state_at(stamp, x, error, command):
     return State(stamp, x[model.POSITION] + error[:3], x[model.VELOCITY] + error[3:6],
                  turn.as_quat(), x[model.RATE] + error[9:12], x[model.TILT] + error[12:],
                  np.zeros(4), stamp - PERIOD, command)
-
-
-def command_of(stamp, values):
-    """Command with tilts and thrusts (8,)."""
-    return Command(stamp, values[:4].copy(), values[4:].copy())
 
 
 def equilibrium(controller, advance, robot):
@@ -161,8 +149,8 @@ def controller_response(controller, x, u, target):
         made = []
         for k in range(EMPTY + LENGTH):
             given = impulse if k == EMPTY else np.zeros(24)
-            command = controller.step(state_at(k * PERIOD, x, given[:16], command_of(
-                (k - 1) * PERIOD, u + given[16:])), target)
+            command = controller.step(state_at(k * PERIOD, x, given[:16], Command(
+                (k - 1) * PERIOD, *np.split(u + given[16:], 2))), target)
             made.append(np.r_[command.tilt, command.thrust])
         return np.array(made[EMPTY:])
 
@@ -191,11 +179,10 @@ def robot_response(advance, x, u):
     return np.concatenate([response[:, :12], response[:, 12:16] / z], 1)    # encoders are late
 
 
-def linear_margins(controller, options):
+def linear_margins(controller):
     """Margins of delay [ms], phase [deg] and gain [1] at hover: commands, tilts, thrusts."""
     robot = RobotParameters.load()
-    flying = registry.find(controller).make(robot, options.get(controller, ControllerOptions()))
-    advance = model.integrator(robot)
+    flying, advance = registry.find(controller).make(robot), model.integrator(robot)
     x, u, target = equilibrium(flying, advance, robot)
     # alone, an impulse would be noise
     with patch.object(NoiseFilter, 'without', lambda self, error, step: error):
@@ -245,23 +232,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--controllers', default='nmpc,rl,rl_any')
     parser.add_argument('--plants', default='robot,measured')
-    parser.add_argument('--task', default='random10')
-    parser.add_argument('--seed', type=int, default=5)
-    parser.add_argument('--policy', type=Path)
     parser.add_argument('--jobs', type=int, default=-1)
     parser.add_argument('--json', type=Path)
     chosen = parser.parse_args()
     plants = {name: 'params/robot.yaml' if name == 'robot' else name
               for name in chosen.plants.split(',') if name}
     names = chosen.controllers.split(',')
-    options = {'rl': ControllerOptions(policy=chosen.policy)} if chosen.policy else {}
-    linear = [linear_margins(name, options) for name in names]
+    linear = [linear_margins(name) for name in names]
     cases = [(name, plant, quantity) for quantity in QUANTITIES for plant in plants.values()
              for name in names]
     console, rows = Console(width=None if sys.stdout.isatty() else 140), []
     with workers(jobs=chosen.jobs):
         for row in joblib.Parallel(batch_size=1, return_as='generator')(
-                joblib.delayed(margin)(*case, chosen) for case in cases):
+                joblib.delayed(margin)(*case) for case in cases):
             rows.append(row)    # a run takes long: each result at once
             console.print(f"{row['controller']}, {row['plant']}, {row['quantity']}: {shown(row)}",
                           markup=False)
@@ -277,10 +260,8 @@ def main() -> None:
         table.add_row(key, *('–' if row[part][key] is None else f'{row[part][key]:.3g}'
                              for row in linear for part in PARTS))
     console.print(table)
-    if chosen.json:
-        chosen.json.write_text(json.dumps({'meta': {
-            key: str(value) for key, value in vars(chosen).items()}, 'linear': linear,
-            'margins': rows}, indent=1) + '\n')
+    write_json(chosen.json, {'meta': {key: str(value) for key, value in vars(chosen).items()},
+                             'linear': linear, 'margins': rows})
 
 
 if __name__ == '__main__':

@@ -15,8 +15,7 @@ has the shipped robot file, or `--robot`; of `--unmet` the robot's own. `--polic
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, dataclass, replace
-import json
+from dataclasses import replace
 from math import ceil
 from pathlib import Path
 import sys
@@ -35,26 +34,13 @@ from beetle_omni_ros.flight.campaign import workers
 from beetle_omni_ros.flight.evaluate import fly
 from beetle_omni_ros.model.allocation import Allocator
 from beetle_omni_ros.model.degraded import sphere
+from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import mass_properties, RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
 POSES, POSE_TIME, OF_DRAWN = 15, 8.0, 10    # of a flight; [s]; poses of a drawn robot
 DRAWN, UNMET = 'drawn', 'unmet'
 DIRECTIONS, FULL_THRUST = 200, 0.85     # of up, at which a robot must hover with a half empty pack
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A flight of ``controller`` with ``seed``; ``kind`` is a condition, or a drawn robot."""
-
-    controller: str
-    kind: str
-    seed: int
-
-    @property
-    def poses(self) -> int:
-        """Number of poses."""
-        return OF_DRAWN if self.kind in (DRAWN, UNMET) else POSES
 
 
 def unmet(rng: np.random.Generator) -> RobotParameters:
@@ -90,21 +76,23 @@ def unmet(rng: np.random.Generator) -> RobotParameters:
             return robot
 
 
-def fly_one(trial: Trial, robot: str | None, plant: str, policy: Path | None) -> dict:
-    """Fly one trial; returns its fields, hours, poses, reached, the errors and the alarms."""
+def fly_one(controller: str, kind: str, seed: int, robot: str | None, plant: str,
+            policy: Path | None) -> dict:
+    """Fly in a condition, or with a drawn robot; returns counts, the errors and the alarms."""
     known, true = RobotParameters.load(robot), RobotParameters.load(plant)
-    if trial.kind == DRAWN:
-        true = true.drawn(np.random.default_rng(trial.seed))
-    elif trial.kind == UNMET:
-        known = true = unmet(np.random.default_rng(trial.seed))
-    task = make_task(f'random{trial.poses}', trial.seed)
-    log = fly(trial.controller, task, robot=known, plant=true, seed=trial.seed,
-              conditions='nominal' if trial.kind in (DRAWN, UNMET) else trial.kind,
-              options={trial.controller: ControllerOptions(policy=policy)})
+    if kind == DRAWN:
+        true = true.drawn(np.random.default_rng(seed))
+    elif kind == UNMET:
+        known = true = unmet(np.random.default_rng(seed))
+    other = kind in (DRAWN, UNMET)
+    task = make_task(f'random{OF_DRAWN if other else POSES}', seed)
+    log = fly(controller, task, robot=known, plant=true, seed=seed,
+              conditions='nominal' if other else kind,
+              options={controller: ControllerOptions(policy=policy)})
     result = metrics(log, task)
     poses, ended = result['poses'], result.get('ended', '')
     alarms = [*log.named_faults(), ended, result.get('controller_error', '')]
-    return {**asdict(trial), 'hours': POSE_TIME * sum(
+    return {'controller': controller, 'kind': kind, 'seed': seed, 'hours': POSE_TIME * sum(
                 pose['U_position_m'] is not None for pose in poses) / 3600,
             'poses': len(poses), 'reached': sum(pose['reached'] for pose in poses),
             'U_position_m': [pose['U_position_m'] for pose in poses],
@@ -150,19 +138,16 @@ def main() -> None:
     parser.add_argument('--json', type=Path)
     chosen = parser.parse_args()
     number = ceil(3600 * chosen.hours / (POSES * POSE_TIME))
-    trials = [Trial(controller, kind, chosen.seed + k)
+    trials = [(controller, kind, chosen.seed + k)
               for controller in chosen.controllers.split(',')
               for kind, count in (('nominal', number), ('published', number),
                                   (DRAWN, chosen.draws), (UNMET, chosen.unmet))
               for k in range(count)]
     console = Console(width=None if sys.stdout.isatty() else 140)
     with workers(jobs=chosen.jobs):
-        flights = list(track(joblib.Parallel(return_as='generator_unordered', batch_size=1)(
-            joblib.delayed(fly_one)(trial, chosen.robot, chosen.plant, chosen.policy)
-            for trial in trials),
-            'flights', total=len(trials), console=console))
-    flights.sort(key=lambda one: trials.index(Trial(*(
-        one[key] for key in ('controller', 'kind', 'seed')))))
+        flights = list(track(joblib.Parallel(return_as='generator', batch_size=1)(
+            joblib.delayed(fly_one)(*trial, chosen.robot, chosen.plant, chosen.policy)
+            for trial in trials), 'flights', total=len(trials), console=console))
     rows = summary(flights)
     table = Table('controller', 'robot', 'hours', 'reached', 'U mean (max)',
                   r'tilt change \[rad/10 ms]', 'flights with an alarm', 'bound [1/h]')
@@ -180,10 +165,8 @@ def main() -> None:
     for row in rows:
         for alarm in row['alarms']:
             console.print(f"{row['controller']}, {row['kind']}, {alarm}", markup=False)
-    if chosen.json:
-        chosen.json.write_text(json.dumps(
-            {'meta': {key: str(value) for key, value in vars(chosen).items()}, 'summary': rows,
-             'flights': flights}, indent=1))
+    write_json(chosen.json, {'meta': {key: str(value) for key, value in vars(chosen).items()},
+                             'summary': rows, 'flights': flights})
 
 
 if __name__ == '__main__':

@@ -7,8 +7,6 @@ constant rate, so that only the shifted centre of mass and inertia remain. Then 
 joints, which adds the reaction of the modules.
 """
 
-import argparse
-
 import mujoco
 import numpy as np
 
@@ -19,6 +17,7 @@ from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant
 
 HEIGHT = np.array([0.0, 0.0, 10.0])     # [m] away from the floor
+STATES = 500                            # of each case
 CASES = (                               # name, tilts, body rates, joint rates, joints held
     ('level hover', 0.0, 0.0, 0.0, True),
     ('hover, tilts within +-pi', np.pi, 0.0, 0.0, True),
@@ -45,12 +44,12 @@ def held_target(plant, state, tilt):
     return tilt - np.linalg.solve(response, rest)
 
 
-def differences(robot, count, tilt_span, rate, joint_rate, held, seed):
-    """Force [N] and torque [N m] differences (count,) at random states."""
+def differences(robot, tilt_span, rate, joint_rate, held):
+    """Force [N] and torque [N m] differences (STATES,) at random states."""
     plant, model = Plant(robot, SimulatorParameters.load()), body_acceleration(robot)
-    generator = np.random.default_rng(seed)
-    force, torque = np.empty(count), np.empty(count)
-    for k in range(count):
+    generator = np.random.default_rng(0)
+    force, torque = np.empty((2, STATES))
+    for k in range(STATES):
         quaternion = rotations.normalized(generator.normal(size=4))
         velocity, angular_velocity = generator.normal(size=3), rate * generator.normal(size=3)
         tilt = tilt_span * generator.uniform(-1, 1, 4)
@@ -67,16 +66,11 @@ def differences(robot, count, tilt_span, rate, joint_rate, held, seed):
 
 def main():
     """Print root mean square and largest difference of each case."""
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--states', type=int, default=500, help='random states of each case')
-    parser.add_argument('--robot', default=None, help='robot file')
-    given = parser.parse_args()
-    robot = RobotParameters.load(given.robot)
+    robot = RobotParameters.load()
     print(f"{'':<30}{'force N':>16}{'torque N m':>18}\n{'':<30}"
           f"{'rms':>8}{'max':>8}{'rms':>10}{'max':>8}")
     for name, *case in CASES:
-        force, torque = differences(robot, given.states, *case, seed=0)
+        force, torque = differences(robot, *case)
         print(f'{name:<30}{np.sqrt((force ** 2).mean()):>8.3f}{force.max():>8.3f}'
               f'{np.sqrt((torque ** 2).mean()):>10.4f}{torque.max():>8.4f}')
     plant = Plant(robot, SimulatorParameters.load())

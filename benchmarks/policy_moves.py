@@ -2,8 +2,7 @@
 Loss of height and errors of a policy in thousands of moves between random poses.
 
     python benchmarks/policy_moves.py [--policy FILE] [--robots 2048] [--moves 5] [--seed 0]
-                                      [--conditions nominal|published] [--without PART ...]
-                                      [--jobs -1] [--json FILE]
+                                      [--without PART ...] [--jobs -1]
 
 Rare failures need more moves than flights of the whole simulation give in an hour. Therefore the
 robots of the training environment fly: one rigid body without estimator and floor. Each robot has
@@ -15,10 +14,9 @@ of each robot is not counted. Needs torch, rsl-rl-lib and onnx (the `train` extr
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
-import json
 from pathlib import Path
-import sys
 
 from joblib import delayed, Parallel
 import numpy as np
@@ -28,15 +26,14 @@ from rich.progress import track
 from rich.table import Table
 import torch
 
+from beetle_omni_ros.bags.log import geodesic_angles
 from beetle_omni_ros.control.base import Command, PoseTarget, State
 from beetle_omni_ros.control.guidance import Guidance, LAYERS
 from beetle_omni_ros.control.policy import PolicyParameters
 from beetle_omni_ros.control.policy_file import find, PolicyNetwork, session
 from beetle_omni_ros.control.tasks import pose_target, random_poses
 from beetle_omni_ros.model import dynamics as model
-from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 from beetle_omni_ros.train.parameters import RandomParameters, StartParameters, TrainParameters
@@ -47,134 +44,81 @@ REACHED = (0.1, np.radians(10))
 PART = 512      # robots of one piece of work
 
 
-class Batched:
-    """
-    A policy file for any number of observations.
-
-    Graphs with fixed shapes for a single observation are called row by row.
-
-    Args:
-        path: path of the ONNX file.
-
-    """
-
-    def __init__(self, path: Path):
-        graph = onnx.load(path)
-        self._single = session(graph.SerializeToString())
-        for value in (*graph.graph.input, *graph.graph.output):
-            value.type.tensor_type.shape.dim[0].dim_param = 'robots'
-        del graph.graph.value_info[:]
-        self._many = session(graph.SerializeToString())
-        size = self._single.get_inputs()[0].shape[1]
-        try:
-            self._call(self._many, np.zeros((2, size), np.float32))
-        except Exception:       # onnxruntime's have no common base class
-            self._many = None
-
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """(N, 8) actions of (N, 33 or 39) observations."""
-        if self._many:
-            return self._call(self._many, observations)
-        return np.vstack([self._call(self._single, row[None]) for row in observations])
-
-    @staticmethod
-    def _call(session, observations):
-        return session.run(None, {'observation': observations})[0]
+def batched(path: Path) -> Callable[[np.ndarray], np.ndarray]:
+    """(N, 8) actions of (N, 33 or 39) observations, by a policy file for a single one."""
+    graph = onnx.load(path)
+    for value in (*graph.graph.input, *graph.graph.output):
+        value.type.tensor_type.shape.dim[0].dim_param = 'robots'
+    del graph.graph.value_info[:]
+    network = session(graph.SerializeToString())
+    return lambda observations: network.run(None, {'observation': observations})[0]
 
 
-def conditions(name: str, random: RandomParameters) -> RandomParameters:
-    """Randomisation of the published training, or latencies of the simulated robot alone."""
-    if name == 'published':
-        published = TrainParameters.load(share_path('params/train_published.yaml')).random
-        return replace(published, carried_share=1.0)
-    zero = {entry.name: 0.0 for entry in fields(RandomParameters)
-            if isinstance(getattr(random, entry.name), float)}
-    return replace(random, **{**zero, 'push_period': 1.0, 'thrust_sag': random.thrust_sag},
-                   command_latency=[0.01, 0.01], velocity_latency=[0.0, 0.0],
-                   tilt_latency=[0.01, 0.01], actuator_spread=[0.0, 0.0])
-
-
-def environment(robots: int, name: str, memory: bool, robot: RobotParameters):
-    """Robots that start in hover, with external targets."""
+def environment(robots: int, memory: bool, robot: RobotParameters):
+    """Robots that start in hover, with external targets and the simulated robot's latencies."""
     p = TrainParameters.load()
     still = {entry.name: 0.0 for entry in fields(StartParameters)}
+    certain = {entry.name: 0.0 for entry in fields(RandomParameters)
+               if isinstance(getattr(p.random, entry.name), float)}
     env = TiltableQuadrotorEnv(replace(
         p, memory=memory, ppo=replace(p.ppo, robots=robots),
         episode=replace(p.episode, duration=1e6, hold_targets=0.0, replay_share=0.0,
                         target_time=np.array([1e3, 1e3]), position_limit=99.0),
         start=StartParameters(**{**still, 'hold': 1.0}),
-        random=conditions(name, p.random)), robot, compiled=False)
+        random=replace(p.random, **{
+            **certain, 'push_period': 1.0, 'thrust_sag': p.random.thrust_sag},
+            command_latency=[0.01, 0.01], velocity_latency=[0.0, 0.0],
+            tilt_latency=[0.01, 0.01], actuator_spread=[0.0, 0.0])), robot, compiled=False)
     env.state['age'].zero_()
     env.state['target_left'].fill_(1e6)
     return env
 
 
-class Fleet:
-    """
-    Robots with their guidance.
-
-    Args:
-        env: training environment.
-        parameters: guidance parameters of the policy.
-        axes: (4, 3) tilt axes.
-
-    """
-
-    def __init__(self, env, parameters, axes):
-        self.env = env
-        self._guidance = [Guidance(axes, parameters.without) for _ in range(env.num_envs)]
-        self._steps = 0
-
-    def show(self, targets: list[PoseTarget]) -> None:
-        """Put the target from guidance of each robot into the environment."""
-        s, stamp = self.env.state, 0.01 * self._steps
-        self._steps += 1
-        x = s['x'].double().numpy()
-        given = s['previous'].double().numpy()
-        position, attitude = np.empty((len(targets), 3)), np.empty((len(targets), 4))
-        for i, (guidance, target) in enumerate(zip(self._guidance, targets)):
-            state = State(stamp, x[i, model.POSITION], x[i, model.VELOCITY],
-                          x[i, model.QUATERNION], x[i, model.RATE], x[i, model.TILT],
-                          x[i, model.TILT_RATE], stamp, Command(stamp, given[i, :4], given[i, 4:]))
-            shown = guidance.target(state, target)
-            position[i], attitude[i] = shown.position, shown.quaternion
-        s['target_position'].copy_(torch.from_numpy(position))
-        s['target_attitude'].copy_(torch.from_numpy(attitude))
-
-
-def fly_part(path, robots, name, memory, parameters, moves, seed):
-    """Fly some of the robots, on one core."""
-    torch.set_num_threads(1)
-    robot = RobotParameters.load()
-    fleet = Fleet(environment(robots, name, memory, robot), parameters, robot.tilt_axes)
-    return fly(fleet, Batched(path), moves, seed)
+def show(env, guided: Sequence[Guidance], targets: Sequence[PoseTarget], stamp: float) -> None:
+    """Put the target from guidance of each robot into the environment."""
+    s = env.state
+    x = s['x'].double().numpy()
+    given = s['previous'].double().numpy()
+    position, attitude = np.empty((len(targets), 3)), np.empty((len(targets), 4))
+    for i, (guidance, target) in enumerate(zip(guided, targets)):
+        state = State(stamp, x[i, model.POSITION], x[i, model.VELOCITY], x[i, model.QUATERNION],
+                      x[i, model.RATE], x[i, model.TILT], x[i, model.TILT_RATE], stamp,
+                      Command(stamp, given[i, :4], given[i, 4:]))
+        shown = guidance.target(state, target)
+        position[i], attitude[i] = shown.position, shown.quaternion
+    s['target_position'].copy_(torch.from_numpy(position))
+    s['target_attitude'].copy_(torch.from_numpy(attitude))
 
 
 @torch.no_grad()
-def fly(fleet: Fleet, policy: Batched, moves: int, seed: int) -> dict[str, np.ndarray]:
+def fly_part(path: Path, robots: int, memory: bool, without: str, moves: int,
+             seed: int) -> dict[str, np.ndarray]:
     """
-    Fly one move that is not counted and then ``moves``.
+    Fly some of the robots on one core: one move that is not counted and then ``moves``.
 
     Returns:
         name -> (moves, N): errors in the windows of the task metrics [m], [rad], depth below
         start and target and lowest height [m]; and `lost` (N,), robots that were reset.
 
     """
-    env, count = fleet.env, fleet.env.num_envs
+    torch.set_num_threads(1)
     torch.manual_seed(seed)
-    poses = random_poses(count * (moves + 2), seed).reshape(moves + 2, count, 6)
+    robot, policy = RobotParameters.load(), batched(path)
+    env = environment(robots, memory, robot)
+    guided = [Guidance(robot.tilt_axes, without) for _ in range(robots)]
+    poses = random_poses(robots * (moves + 2), seed).reshape(moves + 2, robots, 6)
     env.state['x'][:, model.POSITION] = torch.from_numpy(poses[0, :, :3]).float()
-    result = {name: np.zeros((moves + 1, count)) for name in (
+    result = {name: np.zeros((moves + 1, robots)) for name in (
         'U_position', 'U_attitude', 'L_position', 'L_attitude', 'depth', 'lowest')}
-    lost = np.zeros(count, dtype=bool)
+    lost = np.zeros(robots, dtype=bool)
     for k in range(moves + 1):
         targets = [pose_target(pose) for pose in poses[k + 1]]
         place = np.array([target.position for target in targets])
         attitude = np.array([target.quaternion for target in targets])
-        low = np.full(count, np.inf)
+        low = np.full(robots, np.inf)
         floor = np.minimum(place[:, 2], env.state['x'][:, 2].numpy())
         for step in range(SEGMENT):
-            fleet.show(targets)
+            show(env, guided, targets, 0.01 * (k * SEGMENT + step))
             env.advance(torch.from_numpy(policy(env.observation.numpy())))
             lost |= env.done.numpy()
             x = env.state['x'].double().numpy()
@@ -184,16 +128,10 @@ def fly(fleet: Fleet, policy: Batched, moves: int, seed: int) -> dict[str, np.nd
                     share = 1 / (end - first)
                     result[f'{name}_position'][k] += share * np.linalg.norm(
                         x[:, :3] - place, axis=1)
-                    result[f'{name}_attitude'][k] += share * angles(
+                    result[f'{name}_attitude'][k] += share * geodesic_angles(
                         x[:, model.QUATERNION], attitude)
         result['depth'][k], result['lowest'][k] = floor - low, low
     return {**{name: values[1:] for name, values in result.items()}, 'lost': lost}
-
-
-def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N,) angles [rad] between attitudes (N, 4)."""
-    x, y, z, w = rotations.product(*(a * [-1, -1, -1, 1]).T, *b.T)
-    return 2 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
 
 
 def summary(flown: dict[str, np.ndarray]) -> dict[str, float]:
@@ -215,45 +153,37 @@ def summary(flown: dict[str, np.ndarray]) -> dict[str, float]:
     return counts
 
 
-def main() -> int:
+def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--policy', help='ONNX file; default: the shipped one')
     parser.add_argument('--robots', type=int, default=2048)
     parser.add_argument('--moves', type=int, default=5, help='of each robot that count')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--conditions', choices=('nominal', 'published'), default='nominal')
     parser.add_argument('--without', nargs='*', choices=LAYERS, default=[])
     parser.add_argument('--jobs', type=int, default=-1, help='processes; -1: one for each core')
-    parser.add_argument('--json', type=Path)
     given = parser.parse_args()
-    robot, parameters = RobotParameters.load(), PolicyParameters.load()
-    parameters = replace(parameters, without=','.join(given.without))
-    path = given.policy or parameters.policy
+    path = given.policy or PolicyParameters.load().policy
     try:
-        contract = PolicyNetwork(path, robot).contract
+        contract = PolicyNetwork(path, RobotParameters.load()).contract
     except ParameterError as error:
-        print(error, file=sys.stderr)
-        return 1
+        parser.error(str(error))
     sizes = [min(PART, given.robots - first) for first in range(0, given.robots, PART)]
     seeds = np.random.SeedSequence(given.seed).generate_state(len(sizes))
     parts = Parallel(n_jobs=given.jobs, return_as='generator')(
-        delayed(fly_part)(find(path), size, given.conditions, contract.memory, parameters,
+        delayed(fly_part)(find(path), size, contract.memory, ','.join(given.without),
                           given.moves, int(seed)) for size, seed in zip(sizes, seeds))
     parts = list(track(parts, 'flying', len(sizes), console=Console(stderr=True), transient=True))
     result = summary({name: np.concatenate([part[name] for part in parts], axis=-1)
                       for name in parts[0]})
-    table = Table(title=f'{contract.name}, {given.conditions}, seed {given.seed}'
+    table = Table(title=f'{contract.name}, seed {given.seed}'
                   + ''.join(f', without {part}' for part in given.without))
     table.add_column('')
     table.add_column('', justify='right')
     for name, value in result.items():
         table.add_row(name, f'{value:.4g}')
     Console().print(table)
-    if given.json:
-        given.json.write_text(json.dumps({**vars(given), **result}, default=str, indent=1) + '\n')
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -1,6 +1,5 @@
 """Speed of the simulator on one core, and its integration error: ``python benchmarks/sim.py``."""
 
-import argparse
 from dataclasses import replace
 import time
 
@@ -13,6 +12,7 @@ from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.simulator import Simulator
 
+SECONDS = 20.0          # simulated time of each case
 FLIGHT = 2.0            # [s] of open-loop flight before a reset, so that it stays in the air
 HEIGHT = 5.0            # [m]
 SWING = 0.3             # [rad] of the commanded tilts
@@ -52,9 +52,6 @@ def end_state(robot: RobotParameters, refinement: int) -> tuple[np.ndarray, np.n
 
 def main():
     """Print the real-time factor of each case, and the error of the integration step."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--seconds', type=float, default=20.0, help='simulated time of each case')
-    seconds = parser.parse_args().seconds
     robot = RobotParameters.load()
     dragged = replace(robot, effects={'rotor_drag': {'coefficient': 0.4},
                                       'body_drag': {'coefficient': 0.1}})
@@ -63,9 +60,9 @@ def main():
             ('nominal', 'air', robot), ('nominal', 'floor', robot), ('published', 'air', robot),
             ('nominal', 'air, with drag', dragged)]:
         simulator = Simulator(plant, conditions=conditions)
-        cpu = min(fly(simulator, plant, seconds / 2, where != 'floor') for _ in range(2))
-        print(f'{conditions:<12}{where:<16}{2e6 * cpu * simulator.tick / seconds:>9.1f}'
-              f'{seconds / 2 / cpu:>13.0f}')
+        cpu = min(fly(simulator, plant, SECONDS / 2, where != 'floor') for _ in range(2))
+        print(f'{conditions:<12}{where:<16}{2e6 * cpu * simulator.tick / SECONDS:>9.1f}'
+              f'{SECONDS / 2 / cpu:>13.0f}')
     (p, q), (p_fine, q_fine) = end_state(robot, 1), end_state(robot, 4)
     print(f'error of the integration step after {FLIGHT:g} s of open-loop tumbling: '
           f'{1e3 * np.linalg.norm(p - p_fine):.3f} mm, '

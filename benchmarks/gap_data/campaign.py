@@ -42,15 +42,14 @@ def run_campaign(cases: list[Case], tool: str, folder: Path, *, version: str = '
 
     """
     place = folder / 'answers' / hashlib.sha256((tool + version).encode()).hexdigest()[:8]
-    calls = (joblib.delayed(_one)(case, tool, folder, place / f'{case.key()}.json')
-             for case in cases)
-    judged = {}
-    for case, run in joblib.Parallel(return_as='generator_unordered', batch_size=1,
-                                     pre_dispatch='all')(calls):
+    runs = joblib.Parallel(return_as='generator', batch_size=1, pre_dispatch='all')(
+        joblib.delayed(_one)(case, tool, folder, place / f'{case.key()}.json') for case in cases)
+    judged = []
+    for case, run in zip(cases, runs, strict=True):
         if run:
-            judged[case.key()] = judge(open_label(case, folder / 'sealed'), run)
+            judged.append(judge(open_label(case, folder / 'sealed'), run))
         done()
-    return [judged[case.key()] for case in cases if case.key() in judged]
+    return judged
 
 
 def open_label(case: Case, sealed: Path) -> dict:
@@ -68,15 +67,15 @@ def _one(case, tool, folder, kept):
     try:
         flights = make_case(case, folder / 'flights', folder / 'sealed')
     except LostFlight:
-        return case, None
+        return None
     if not tool:
-        return case, None
+        return None
     if kept.is_file():
-        return case, json.loads(kept.read_text())
+        return json.loads(kept.read_text())
     run = ask(tool, flights)
     kept.parent.mkdir(parents=True, exist_ok=True)
     write_json(kept, run)
-    return case, run
+    return run
 
 
 def ask(tool: str, case: Path) -> dict:

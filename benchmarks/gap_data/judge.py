@@ -44,8 +44,10 @@ def judge(label: dict, run: dict) -> dict:
         'closure': answer.get('closure'), 'gap_before': answer.get('gap_before'),
         'gap_after': answer.get('gap_after'), 'wall_s': run['wall_s'], 'cpu_s': run['cpu_s'],
         'message': run['message'],
-        'parameters': [row for truth, effect in zip(truths, matches) if effect is not None
-                       for row in _parameters(truth, effect['parameters'])]}
+        'parameters': [_row(truth['name'], name, true, effect['parameters'][name])
+                       for truth, effect in zip(truths, matches) if effect is not None
+                       for name, true in truth['parameters'].items()
+                       if name in effect['parameters']]}
     return {**judged, 'right': _right(judged, label, found)}
 
 
@@ -74,13 +76,9 @@ def _right(judged, label, found):
     return accepted
 
 
-def _parameters(truth, given):
-    """Error and coverage of each true parameter that the answer gives."""
-    return [_row(truth['name'], name, np.atleast_1d(true), given[name])
-            for name, true in truth['parameters'].items() if name in given]
-
-
 def _row(effect, name, true, entry):
+    """Error and coverage of a true parameter that the answer gives."""
+    true = np.atleast_1d(true)
     value = np.atleast_1d(entry['value'])
     interval = np.reshape(entry['interval'], (len(true), 2))
     if effect in COMMAND_DELAYS and abs(value[0] - true[0]) > abs(
