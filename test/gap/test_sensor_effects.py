@@ -140,9 +140,8 @@ def test_tilts_follow_the_servo_model_if_encoders_are_noisy():
     assert rms(after[1][inside]) < 0.05 * rms(before[1][inside])
 
 
-@pytest.mark.parametrize('name', ['base.tilt_delay', 'servo.kd[2]', 'joint_bandwidth.kp'])
-def test_what_moves_the_servo_model_moves_the_body_if_encoders_are_noisy(name):
-    h, made = 1e-3, [model(noisy(0.02)) for _ in range(2)]
+def test_late_tilt_commands_also_move_the_body_if_encoders_are_noisy():
+    name, h, made = 'base.tilt_delay', 1e-3, [model(noisy(0.02)) for _ in range(2)]
     for each, theta in zip(made, ({}, {name: h}), strict=True):
         each.settle(theta)      # the tilts of the body are those of the servo model
     slopes = made[0].linear({}, [name]).slopes[:, PLACE['B'], 0]

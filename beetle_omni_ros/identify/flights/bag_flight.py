@@ -33,8 +33,9 @@ PLACE = {'B': slice(0, 6), 'A': slice(6, 9), 'W': slice(9, 12), 'J': slice(12, 1
 # Time shift of an encoder reading, and of a pose of MoCap, for each second of delay of a sensor.
 SHIFTS = dict.fromkeys(delays_of('imu'), -1.0) | dict.fromkeys(delays_of('encoders'), 1.0)
 POSE_SHIFTS = dict.fromkeys(delays_of('imu'), -1.0) | dict.fromkeys(delays_of('mocap'), 1.0)
-# Keys by which the tilts of a servo model are as late as by the delay of its bus.
-LATE_TILTS = IMU_LAG, 'command_latency.delay', 'joint_command_latency.delay'
+# Keys by which the tilts of a servo model are late. Gains are those of the joints alone: with
+# forces, a fit takes the answer of a controller to noise for softer servos.
+LATE_TILTS = {TILT_BUS, IMU_LAG, 'command_latency.delay', 'joint_command_latency.delay'}
 # Parameters with central differences. With one-sided ones, slopes of equivalent delays differ by
 # the second derivative, and a linear fit exploits the difference.
 BOTH_SIDES = 'delay'
@@ -255,22 +256,17 @@ class BagFlight:
         turning = [name for name in names if 'J' in self.keys[name].groups]
         for name, slope in zip(turning, self._joint_slopes(theta, turning), strict=True):
             slopes[:, PLACE['J'], names.index(name)] = slope
-        if (tilts := self.signals.model_tilts) is not None:
-            for name, slope in self._of_model_tilts(tilts, theta, now['B'], names).items():
-                if name in names:
-                    slopes[:, PLACE['B'], names.index(name)] += slope
+        late = sorted(LATE_TILTS & set(names))
+        if self.signals.model_tilts is not None and late:
+            slopes[:, PLACE['B'], [names.index(name) for name in late]] += \
+                self._of_late_tilts(theta, now['B'])[:, :, None]
         return slopes
 
-    def _of_model_tilts(self, tilts, theta, now, names):
-        """Name -> derivative (M, 6) of forces and torques by what moves tilts of a model."""
-        names = [TILT_BUS, *(name for name in names
-                             if self.keys[name].effect in ('joint_bandwidth', 'servo'))]
-        steps = [self.keys[name].step for name in names]
-        runs = self._servos([{**theta, name: theta.get(name, 0.0) + h}
-                             for name, h in zip(names, steps, strict=True)], theta)
-        slopes = {name: (self._with_tilts(tilts, run, theta, 'B')['B'] - now) / h
-                  for name, run, h in zip(names, runs, steps, strict=True)}
-        return slopes | dict.fromkeys(LATE_TILTS, slopes[TILT_BUS])
+    def _of_late_tilts(self, theta, now):
+        """Derivative (M, 6) of forces and torques by the delay of the tilts of a servo model."""
+        h = self.keys[TILT_BUS].step
+        run, = self._servos([{**theta, TILT_BUS: theta.get(TILT_BUS, 0.0) + h}], theta)
+        return (self._with_tilts(self.signals.model_tilts, run, theta, 'B')['B'] - now) / h
 
     def _of_pose_shift(self, theta):
         """

@@ -229,16 +229,16 @@ class Linearised:
         """
         step = theta - self.point
         step[:self.known][self.curved] = 0.0
-        if not theta[:self.known][self.curved].any() \
-                and (np.abs(step) <= self.typical)[:self.known].all():
+        acts = theta[:self.known][self.curved].any()
+        if not acts and (np.abs(step) <= self.typical)[:self.known].all():
             return theta
-        starts, points = self.flights[0].starts, []
+        starts, points = self.flights[0].starts if acts else {}, []
         fitted = dict(zip(self.names, theta[:self.known], strict=False))
         before = {name: dict(start) for name, start in starts.items()}
         for part in STEPS:
             starts.update({name: dict(start) for name, start in before.items()})
             at = theta - (1 - part) * step
-            for name, value in self.flights[0].restart(fitted, part).items():
+            for name, value in (self.flights[0].restart(fitted, part) if acts else {}).items():
                 at[self.index[name]] = value
             left = sum(self._left(k, at + eta, found) for k, (eta, found) in enumerate(
                 zip(etas, spectra, strict=True)))
