@@ -13,6 +13,7 @@ import argparse
 from collections import namedtuple
 from contextlib import closing
 from dataclasses import replace
+import importlib.util
 from pathlib import Path
 import tempfile
 from time import process_time
@@ -288,6 +289,8 @@ def main():
     parser.add_argument('--out', type=Path, default=Path('runs_out/formulas.json'),
                         help='results; finished cases are kept in a folder beside it')
     given = parser.parse_args()
+    if given.baseline and importlib.util.find_spec('pysindy') is None:
+        parser.error('--baseline: expected the package pysindy, which is no dependency')
     code = digest(*(path.read_bytes() for path in (
         Path(__file__), *sorted(SOURCE.rglob('*.py')))))
     cases = [Case(f'{kind} {names[k % len(names)]} {k}', code, 1, kind, names[k % len(names)], k,

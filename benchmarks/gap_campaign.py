@@ -30,6 +30,7 @@ from gap_data.score import markdown, score  # noqa: E402
 
 from beetle_omni_ros.flight.campaign import digest, SOURCE, workers  # noqa: E402
 
+CONDITIONS = 'nominal', 'published'
 TOOL = f'{sys.executable} -m beetle_omni_ros'
 
 
@@ -39,17 +40,17 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--set', default='fast', choices=tuple(load_settings()['sets']))
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--cases', type=int, help='only so many, spread over the set')
-    parser.add_argument('--only', default='', help='only these kinds, difficulties and effects, '
-                        'separated by commas: of each sort that is named, one must fit')
+    parser.add_argument('--only', default='', help='only these kinds, difficulties, conditions '
+                        'and effects, separated by commas; of each sort named, one must fit')
     parser.add_argument('--tool', default=TOOL, help='command before `gap` (this tree)')
     parser.add_argument('--flights-only', action='store_true', help='make the flights, ask nobody')
     parser.add_argument('--folder', type=Path, default=Path('runs_out/gap_campaign'))
     parser.add_argument('--jobs', type=int, help='at a time (every core)')
     given = parser.parse_args(arguments)
-    unknown = {*filter(None, given.only.split(','))} - {*KINDS, *DIFFICULTIES, *CATALOGUE,
-                                                         *OUTSIDE}
+    unknown = {*filter(None, given.only.split(','))} - {
+        *KINDS, *DIFFICULTIES, *CONDITIONS, *CATALOGUE, *OUTSIDE}
     if unknown:
-        parser.error(f"--only '{given.only}': no kind, difficulty or effect is called "
+        parser.error(f"--only '{given.only}': no kind, difficulty, condition or effect is called "
                      f"{', '.join(sorted(unknown))}")
     return given
 
@@ -57,10 +58,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 def chosen(given: argparse.Namespace) -> list:
     """Cases of the command line."""
     names = {*filter(None, given.only.split(','))}
-    kinds, difficulties = names & set(KINDS), names & set(DIFFICULTIES)
-    effects = names - kinds - difficulties
+    kinds, difficulties, conditions = (
+        names & set(each) for each in (KINDS, DIFFICULTIES, CONDITIONS))
+    effects = names - kinds - difficulties - conditions
     cases = [c for c in make_cases(given.set, given.seed)
              if c.kind in (kinds or KINDS) and c.difficulty in (difficulties or DIFFICULTIES)
+             and c.conditions in (conditions or CONDITIONS)
              and (not effects or effects & {e[0] for e in c.effects})]
     if given.cases is not None and given.cases < len(cases):
         step = (len(cases) - 1) / max(1, given.cases - 1)

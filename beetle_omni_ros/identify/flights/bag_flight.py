@@ -218,7 +218,7 @@ class BagFlight:
         return np.concatenate([body[self.rows], seen[self.rows], self._of_joints(
             self.signals.joints(theta)[3][first:first + count])], axis=1)
 
-    def reading_noise(self) -> np.ndarray:
+    def encoder_noise(self) -> np.ndarray:
         """(M, 16) drawn noise of the encoders, as large as that of their readings; others: 0."""
         noise = np.zeros((len(self.rows), len(self.channels)))
         first, count = self._starts[0], self._length * len(self._starts)
@@ -323,17 +323,21 @@ class BagFlight:
         Noise in the tilts would enter the residual and the slopes of the body equations. A fit
         explains its second derivative by a larger mass of the tilting modules, for example.
         """
-        s, theta = self.signals, self._real(theta)[0]
-        if s.reading_noise < self.p.guide_above:
-            return
-        self._use_tilts(s.joints(theta)[0], self._servos([theta], theta)[0])
-        self._kept = None, None
+        if self.noisy:
+            theta = self._real(theta)[0]
+            self._use_tilts(self.signals.joints(theta)[0], self._servos([theta], theta)[0])
+            self._kept = None, None
 
     def _use_tilts(self, tilts, run):
         """Take the fast tilts from simulated servos, beside their windows from ``tilts``."""
         tilts, first = tilts.copy(), self._starts[0]
         tilts[first:first + run.size // 4] = run.reshape(-1, 4)
         self.signals.use_model_tilts(tilts)
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the fast tilts of the body equations are those of the servo model."""
+        return self.signals.reading_noise >= self.p.guide_above
 
     @property
     def motion(self) -> dict[str, np.ndarray]:

@@ -120,8 +120,9 @@ class Engine(Linearised):
             value = weight(chosen)
             if value > top:
                 best, top = chosen, value
-        visited: list[tuple[int, ...]] = []     # pairwise gains need not be transitive: the
-        while best not in visited:              # next set must be better than all before it
+        # Pairwise gains need not be transitive: the next set must be better than all before it.
+        visited: list[tuple[int, ...]] = []
+        while best not in visited:
             visited.append(best)
             near = {tuple(sorted(set(best) - out | more))
                     for out in [set(), *({k} for k in best)]

@@ -189,7 +189,7 @@ class Linearised:
             elif len(bands[flight.turning]) < len(DYNAMIC):
                 bands |= dict.fromkeys(('force', 'torque', 'joint'), [])
             if flight.turning:      # its answer biases gains by less than servos differ
-                noise = self.transformed(k, flight.reading_noise()).residual
+                noise = self.transformed(k, flight.encoder_noise()).residual
                 bands['joint'] = sorted({*bands['joint'], *self._hidden(
                     each, dict(self._in_loop())['joint'], noise, whole,
                     flight.p.tolerance_lag**2)})

@@ -96,7 +96,7 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     if len(models) > 1:
         priors |= {n: replace(priors[n], flight=0.0) for n in varying}
     # with noisy encoders, servos act on the body, whose noise a controller answers
-    noisy = any(m.signals.reading_noise >= p.guide_above for m in models)
+    noisy = any(model.noisy for model in models)
     entries = [replace(entry, in_loop=entry.in_loop or noisy) for entry in entries]
     engine = Engine(models, priors, entries, bounds, far, alpha, varying=varying,
                     kept=frozenset(kept), clock=IMU_LAG, curved=frozenset({*starts, *tangents}))
