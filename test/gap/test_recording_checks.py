@@ -273,6 +273,33 @@ def test_what_is_harmless_is_used_and_stated(change, words):
     assert np.allclose(before[:999], after[-len(before):][:999]) or not made.findings
 
 
+def slow(turn):
+    """A level path of 0.5 m/s^2; markers that are turned [rad], and a bias of 0.3 m/s^2."""
+    made = recording()
+    t, sent = (made.times[topic] - made.times[IMU][0] for topic in (IMU, COMMAND))
+    move = np.column_stack([np.sin(0.9 * t), np.sin(1.3 * t), np.cos(0.7 * t)])
+    rng, squares = np.random.default_rng(0), np.square([0.9, 1.3, 0.7])
+    made.values[IMU] = np.column_stack([-0.4 * squares * move + [0.3, 0, ROBOT.gravity], 0 * move]
+                                       ) + 0.02 * rng.normal(size=(len(t), 6))
+    path = [np.interp(made.times[POSE] - made.times[IMU][0], t, 0.4 * x) for x in move.T]
+    made.values[POSE] = np.column_stack([*path, np.tile([0, 0, 0, 1.0], (len(path[0]), 1))])
+    made.values[POSE][:, 2] += 1.2
+    made.values[POSE][:, :3] += 1e-4 * rng.normal(size=(len(path[0]), 3))
+    made.values[JOINTS][:] = 0.0015 * rng.integers(-1, 2, made.values[JOINTS].shape)
+    made.values[COMMAND][:] = [0.0] * 4 + [ROBOT.hover_thrust] * 4
+    made.values[COMMAND][:, 4:] *= 1 - 0.02 * np.cos(0.7 * sent)[:, None]
+    noise = 1e-4 * rng.normal(size=(len(path[0]), 3))
+    return turned_pose(made, body=Rotation.from_rotvec(turn + noise))
+
+
+def test_gravity_along_turned_markers_is_no_damage_of_a_slow_flight():
+    # 3 deg turn more of gravity into a level axis than the motion has.
+    assert checked(slow([0.04, 0.03, 0.02]), ROBOT, 0.0)[2] == []
+    wrong = of(POSE, 0, 3, lambda v: v[:, [1, 0, 2]])(slow([0.04, 0.03, 0.02]))
+    damage, = checked(wrong, ROBOT, 0.0)[2]     # at one attitude it could also be the IMU
+    assert damage.topic in (IMU, POSE) and 'swapped' in damage.cause
+
+
 def rested(before, after):
     """A recording with rests [s] on the ground, in which neither MoCap nor encoders change."""
     made = recording()

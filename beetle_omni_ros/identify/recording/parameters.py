@@ -124,6 +124,8 @@ class RecordingLimits(ParameterFile, file='recording.yaml'):
         unit='rad', doc='Motion by the command that an encoder must show within the lag.')
     gain: float = limit(unit='1', doc='Largest ratio of two measurements of one motion.')
     thrust_gain: float = limit(unit='1', doc='Largest ratio of thrusts and specific force.')
+    mounting: float = limit(unit='rad', doc='Largest angle between IMU and MoCap.')
+    bias: float = limit(unit='m/s^2', doc='Largest bias of the accelerometer.')
     edge: float = limit(unit='Hz', doc='Low-pass edge of comparisons of two sensors.')
     window: float = limit(unit='s', doc='Time over which two signals are compared.')
     bin: float = limit(unit='s', doc='Time over which ages are compared.')

@@ -21,6 +21,8 @@ from beetle_omni_ros.identify.recording.series import aligned, low_pass, matrice
 from beetle_omni_ros.model.parameters import RobotParameters
 
 GRAVITY = 'gravity'     # [m/s^2] that the accelerometer measures
+I3, I4 = np.eye(3), np.eye(4)
+SHOWN = 0.02            # share of the largest slope below which a flight does not show an angle
 THINNED = 4             # points of the fine grid for each point of the coarse one
 
 
@@ -59,10 +61,23 @@ class Smoothed:
         return rate, self.data[IMU][0, :, 3:]
 
     def pushing(self) -> tuple[np.ndarray, np.ndarray]:
-        """Accelerations (N, 3) [m/s^2] by MoCap and accelerometer, body axes."""
-        rotation = matrices(self.data[POSE][0, :, 3:])
+        """
+        Accelerations (N, 3) [m/s^2] by MoCap and accelerometer, body axes.
+
+        The second one is without what a small angle between both and a bias explain: in a slow
+        flight, gravity along a wrong axis is more than the motion.
+        """
+        rotation, limits = matrices(self.data[POSE][0, :, 3:]), shipped()
         seen = np.einsum('nij,ni->nj', rotation, self.data[POSE][2, :, :3])
-        return seen, self.data[IMU][0, :, :3] - self.data[GRAVITY][0] * rotation[:, 2]
+        weight = self.data[GRAVITY][0] * rotation[:, 2]
+        felt = self.data[IMU][0, :, :3] - weight
+        most = np.repeat([limits.mounting, limits.bias], 3)
+        slopes = most * np.concatenate([np.cross(I3, weight[:, None]).transpose(0, 2, 1),
+                                        np.broadcast_to(I3, (len(felt), 3, 3))], axis=2)
+        small, *_ = np.linalg.lstsq(slopes.reshape(-1, 6), (felt - seen).ravel(), SHOWN)
+        if max(np.linalg.norm(small[:3]), np.linalg.norm(small[3:])) < 1:
+            felt = felt - slopes @ small
+        return seen, felt
 
     def tilting(self) -> tuple[np.ndarray, np.ndarray]:
         """Tilts (N, 4) [rad] by encoders and commands, without their means."""
@@ -214,7 +229,6 @@ TURNS = [axes for axes in SIGNED if np.linalg.det(axes) > 0]
 UPS = {tuple(axes[:, 2]): axes for axes in TURNS if axes[2, 2] < 1}     # any heading
 SIGNS = [np.diag(signs) for signs in product((1.0, -1.0), repeat=4)][1:]
 ORDERS = [np.eye(4)[list(order)] for order in permutations(range(4))][1:]
-I3, I4 = np.eye(3), np.eye(4)
 MIRRORS = [np.diag(np.where(np.arange(3) == k, -1.0, 1.0)) for k in range(3)]
 
 
