@@ -31,6 +31,7 @@ WIDEST = 9.0            # typical deviations of the widest prior of an entry
 TESTS = 2               # of what is unexplained; they share the accepted probability
 MOST_FED_BACK = 2       # entries that feedback may exclude; with more, the loop hides the robot
 FORM_DEVIATION = 0.1    # of a value: deviation by the error of form of its law
+MINOR = 0.1             # share of the gain of what repeats below which names explain too little
 STILL = 'noise hides the motion, so that only means are compared'
 Starts = dict[str, dict[str, float]]
 
@@ -109,7 +110,8 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
         e, s, own, named, starts or {}, alpha / len(tests))]
     rest = unexplained(engine, solution) if measured else []
     fed_back = sorted(solution.entries[k].name.replace('_', ' ') for k in solution.banned)
-    verdict, reason = verdict_of(chance, sets, rest, fed_back, alpha)
+    verdict, reason = verdict_of(chance, sets, rest, fed_back, alpha, max(
+        (effect['evidence']['ln_bayes_factor'] for effect in effects), default=0.0))
     return result_of(
         verdict, {**groups, **{kind: groups[kind] | {'reason': STILL}
                                for kind in engine.without_motion}}, reason,
@@ -123,7 +125,7 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
         held_out=held_out, findings=[*findings, *varied(engine, solution), *(
             test.sentence[:1].upper() + test.sentence[1:] for test in rest
             if test.probability < alpha / TESTS and verdict != 'unknown')],
-        **numbers_of(engine, solution, taken[0], judges))
+        **numbers_of(engine, solution, taken[0] if verdict in NAMING else [], judges))
 
 
 def named_of(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int, list[int]]]:
@@ -319,7 +321,7 @@ def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: li
 
 
 def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
-               fed_back: list[str], alpha: float) -> tuple[str, str]:
+               fed_back: list[str], alpha: float, evidence: float = 0.0) -> tuple[str, str]:
     """
     Verdict on flights and, without names, its reason as the end of a sentence.
 
@@ -329,19 +331,21 @@ def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
         rest: tests of what no entry explains, the most improbable first.
         fed_back: entries that were excluded because of feedback.
         alpha: accepted probability of a false alarm.
+        evidence: of the surest of the named entries [nat].
 
     """
     if len(fed_back) > MOST_FED_BACK:
         return 'not_decidable', (
             'the controller answers noise more than it flies: the values of '
             f"{', '.join(fed_back)} differ between frequencies")
+    repeats = bool(rest) and rest[0].probability < alpha / TESTS
     small = [len(members) for members in sets if len(members) < CROWD]
-    if small:
+    if small and not (repeats and evidence < MINOR * rest[0].gain):
         return 'named_set' if max(small) > 1 else 'named', ''
-    if sets:
+    if sets and not small:
         return 'not_decidable', (
             f"they do not separate {' and '.join(map(' or '.join, sets))}".replace('_', ' '))
-    if rest and rest[0].probability < alpha / TESTS:
+    if repeats:
         return 'unknown', rest[0].sentence
     if chance > alpha:
         return 'no_gap', ''
