@@ -25,7 +25,7 @@ setup-train:  # the same with what training needs
 	@PYTHON='$(PYTHON)' .ci/setup train
 
 fly: setup  ## fly the waypoints through ROS nodes, seen in the browser; bag and film in runs_out/
-	$(TOOL) fly --controller nmpc --task waypoints --view $(ARGS)
+	$(TOOL) fly --controller nmpc --task waypoints --alone --view $(ARGS)
 
 test: setup-train  ## the whole test suite
 	@.ci/test $(ARGS)

@@ -313,10 +313,13 @@ def _metadata(path, warnings):
     file = (path if path.is_dir() else path.absolute().parent) / 'metadata.yaml'
     if not file.is_file():
         warnings.append('metadata.yaml is missing: the recorder did not finish')
-        return {}
+        return {'interrupted': True} if path.is_dir() else {}
     try:
         custom = read_yaml(file)['rosbag2_bagfile_information']['custom_data']
-        return dict(json.loads((custom or {}).get(META_KEY, '{}')))
+        meta = dict(json.loads((custom or {}).get(META_KEY, '{}')))
+        if meta.get('interrupted'):
+            warnings.append('interrupted; kept what was flown')
+        return meta
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError):
         warnings.append('metadata.yaml is not readable')
         return {}

@@ -234,11 +234,9 @@ def check_new(path: str | Path) -> None:
         raise ParameterError(f'{path}: {parent} is not a folder that can be written')
 
 
-def add_meta(path: str | Path, meta: dict) -> None:
-    """Add metadata of the flight to a finished bag of a :class:`BagWriter`."""
+def set_meta(path: str | Path, meta: dict) -> None:
+    """Set the metadata of the flight in a finished bag of a :class:`BagWriter`."""
     file = Path(path) / 'metadata.yaml'
     content = read_yaml(file)
-    information = content['rosbag2_bagfile_information']
-    known = json.loads((information['custom_data'] or {}).get(META_KEY, '{}'))
-    information['custom_data'] = {META_KEY: json.dumps({**known, **meta})}
+    content['rosbag2_bagfile_information']['custom_data'] = {META_KEY: json.dumps(meta)}
     write_text(file, yaml.safe_dump(content), 'metadata')

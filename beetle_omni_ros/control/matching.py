@@ -108,8 +108,7 @@ class ModelMatching:
                 -step / self._trained.rotors.time_constant)) * (self._own.thrust - self._thrust)
         self._ahead = max(self._estimator.delay - self._own_delay, 0.0)
         self._seen = seen = self._estimator.flown(present, state.stamp, self._ahead)
-        tilt = self._estimator.reading + seen[model.TILT] - present[model.TILT] \
-            - self._acting[:4]
+        tilt = self._estimator.reading + seen[model.TILT] - present[model.TILT] - self._acting[:4]
         return replace(flown(state, seen, tilt), command=own or state.command)
 
     def sent(self, own: Command) -> Command:

@@ -268,8 +268,7 @@ class ServoBus:
 
     def _restart_watchdog(self, servos):
         for counts in (0, xc330.WATCHDOG_COUNTS):
-            self.link.sync_write(xc330.WATCHDOG,
-                                  {servo.identifier: counts for servo in servos})
+            self.link.sync_write(xc330.WATCHDOG, {servo.identifier: counts for servo in servos})
 
     def _sync_read(self, asked, address, length):
         """Pairs of the servos with a valid answer and their data."""

@@ -268,8 +268,7 @@ class SupervisorComponent(Component):
             supervisor.state, WARN if supervisor.faults else OK)
         named = ', '.join(supervisor.faults)
         state = self.newest['supervisor/state']
-        return level, f'{state}; faults: {named}' if named else state, \
-            supervisor.diagnostics()
+        return level, f'{state}; faults: {named}' if named else state, supervisor.diagnostics()
 
 
 class ProcessFaults(Schedule):

@@ -350,5 +350,4 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
 
 
 def _text(numbers):
-    return np.array2string(np.asarray(numbers), precision=5, separator=', ',
-                           suppress_small=True)
+    return np.array2string(np.asarray(numbers), precision=5, separator=', ', suppress_small=True)

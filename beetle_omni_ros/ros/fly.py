@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from contextlib import contextmanager, ExitStack, suppress
 from functools import partial
+import json
 import os
 from pathlib import Path
 from statistics import median
@@ -15,7 +16,7 @@ from rich.console import Console
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bags.bag import read_bag
-from beetle_omni_ros.bags.bag_writer import add_meta, check_new
+from beetle_omni_ros.bags.bag_writer import check_new, set_meta
 from beetle_omni_ros.bags.log import motion, Recorder
 from beetle_omni_ros.bags.metrics import failed, metrics
 from beetle_omni_ros.control import registry
@@ -96,6 +97,7 @@ def run_fly(*, bag: Path, controller: str = registry.DEFAULT, task: str = 'waypo
                 'controller': registry.find(controller).name, 'clock': clock,
                 'actuators': nodes['sim_node'].get('actuators', 'direct'),
                 **({'faults': [str(fault) for fault in injected]} if injected else {})}
+        nodes['recorder_node']['meta'] = json.dumps({**meta, 'interrupted': True})  # to the end
         graph = Graph(nodes, folder, number)
         failure = slow = ''
         try:
@@ -153,8 +155,6 @@ def _conclude(graph, bag, task, meta, failure, slow, json_path, console, full, f
             result = _report(bag, meta['controller'], task, meta, json_path, console, full, film)
             failure = failure or failed(result)
         if 'interrupted' in meta:
-            if bag.exists():
-                _print(console, 'interrupted; kept what was flown')
             raise KeyboardInterrupt
         if failure:
             _complain(failure + slow)
@@ -321,7 +321,7 @@ class Flight(Operator):
 
 def _report(bag, controller, task, meta, json_path, console, full, film) -> dict:
     if (bag / 'metadata.yaml').exists():
-        add_meta(bag, meta)
+        set_meta(bag, meta)
     log = read_bag(bag)
     for line in log.warnings:
         _print(console, line, style='yellow')

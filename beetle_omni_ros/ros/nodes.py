@@ -1,6 +1,7 @@
 """ROS nodes of estimator, controllers, supervisor, targets of a task, recorder and viewers."""
 
 from functools import partial
+import json
 import sys
 
 from rcl_interfaces.srv import SetParameters
@@ -83,13 +84,18 @@ class RecorderNode(FlightNode):
         super().__init__(
             'recorder_node',
             bag=parameter(doc='folder to create for the bag'),
+            meta=parameter('{}', doc='metadata of the flight, as JSON'),
             controllers=parameter(registry.STANDING_BY,
                                   doc='registered controllers whose commands are recorded'),
             components=parameter((), doc='components whose topics are recorded: FILE.py:Class'))
         for reference in self.parameters.components:
             component_class(reference)      # its module registers its topics
         topics = topics_with(self.parameters.controllers)
-        self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
+        try:
+            meta = dict(json.loads(self.parameters.meta))
+        except (TypeError, ValueError):
+            raise ParameterError("key 'meta': expected a JSON object") from None
+        self._bag = BagWriter(self.parameters.bag, meta, namespace=self.get_namespace(),
                               topics=tuple(topics), frames=True)
         self._written = self._lost = self._writes = 0
         self._failure = None

@@ -285,8 +285,7 @@ class TiltableQuadrotorEnv:
         way = changed['target_position'] - new['target_position']
         turn = batch.geodesic(batch.matrix(changed['target_attitude']),
                               batch.matrix(new['target_attitude']))
-        near = (way.norm(dim=-1) <= guidance.NEAR_DISTANCE) \
-            & (turn <= guidance.NEAR_ANGLE)
+        near = (way.norm(dim=-1) <= guidance.NEAR_DISTANCE) & (turn <= guidance.NEAR_ANGLE)
         changed['trim'] = new['trim'] * near[:, None]
         # A strong force comes and goes with the targets, because a robot also meets it in flight.
         for name, other in (('wrench', 'other_wrench'), ('other_wrench', 'wrench')):

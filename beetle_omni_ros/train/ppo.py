@@ -201,5 +201,4 @@ class GraphPpo(PPO):
 
 def log_probability(action: torch.Tensor, mean: torch.Tensor, std: torch.Tensor) -> torch.Tensor:
     """(...,) log density of (..., 8) actions under a diagonal Gaussian."""
-    return -(0.5 * ((action - mean) / std) ** 2 + torch.log(std)
-             + 0.5 * log(2 * pi)).sum(-1)
+    return -(0.5 * ((action - mean) / std) ** 2 + torch.log(std) + 0.5 * log(2 * pi)).sum(-1)

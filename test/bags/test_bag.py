@@ -22,7 +22,7 @@ import yaml
 
 from beetle_omni_ros.bags import conversions
 from beetle_omni_ros.bags.bag import names_of, read_bag
-from beetle_omni_ros.bags.bag_writer import add_meta, BagWriter
+from beetle_omni_ros.bags.bag_writer import BagWriter, set_meta
 from beetle_omni_ros.bags.log import FlightLog, LogRecorder, Recorder, SERIES
 from beetle_omni_ros.bags.messages import new, to_bytes, TYPESTORE, Wrench
 from beetle_omni_ros.control.base import Command
@@ -148,11 +148,12 @@ def test_compute_times_come_from_the_diagnostics_of_the_nodes(tmp_path):
     assert 'diagnostics: 1 messages not used' in log.warnings[-1]
 
 
-def test_meta_data_can_be_added_to_a_finished_bag(tmp_path):
-    with BagWriter(tmp_path / 'bag', {'task': 'hover'}) as writer:
+def test_a_flight_counts_as_interrupted_until_its_end_sets_the_meta_data(tmp_path):
+    with BagWriter(tmp_path / 'bag', {'task': 'hover', 'interrupted': True}) as writer:
         write_imu(writer, 1.0, (0, 0, 9.8), (0, 0, 0))
-    add_meta(tmp_path / 'bag', {'seed': 3})
-    assert read_bag(tmp_path / 'bag').meta == {'task': 'hover', 'seed': 3}
+    assert read_bag(tmp_path / 'bag').warnings[0] == 'interrupted; kept what was flown'
+    set_meta(tmp_path / 'bag', {'seed': 3})
+    assert read_bag(tmp_path / 'bag').meta == {'seed': 3}
     with AnyReader([tmp_path / 'bag'], default_typestore=TYPESTORE) as reader:
         assert reader.message_count == 1
 

@@ -162,8 +162,7 @@ def test_messages_of_equal_layout_are_read_together_as_one_by_one(topic, drawn):
 @pytest.mark.parametrize('topic', [name for name in SERIES if name != 'rotor_states'])
 def test_non_finite_values_are_read_but_refused_in_flight(topic):
     entry, sent = ALL[topic], value(topic)
-    name = next(field.name for field in fields(sent)
-                if field.name not in ('stamp', 'names'))
+    name = next(field.name for field in fields(sent) if field.name not in ('stamp', 'names'))
     part = getattr(sent, name)
     spoilt = replace(sent, **{name: part * np.nan if isinstance(part, np.ndarray) else np.nan})
     message = from_bytes(cdr(topic, spoilt), entry.type)

@@ -52,8 +52,7 @@ def test_takes_over_without_a_jump_from_any_command_in_force():
         command = controller.step(replace(state, stamp=stamp, quaternion=unit(rng, 4),
                                           command=in_force), PoseTarget(HOME, unit(rng, 4)))
         assert np.abs(command.tilt - in_force.tilt).max() <= TILT_RATE * PERIOD + 1e-9
-        assert np.abs(command.thrust - in_force.thrust).max() \
-            <= THRUST_RATE * PERIOD + 1e-9
+        assert np.abs(command.thrust - in_force.thrust).max() <= THRUST_RATE * PERIOD + 1e-9
 
 
 def test_the_disturbance_estimate_converges_while_another_controller_is_active():

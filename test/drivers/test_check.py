@@ -153,8 +153,7 @@ def test_each_fault_of_the_bus_is_found_and_named(name):
         break_it(emulated)
         asked, handle = set(), emulated.handle
         emulated.handle = lambda packet, *rest: asked.add(packet[1]) or handle(packet, *rest)
-        found = repeated(lambda: servos(emulated.port),
-                         lambda found: levels(found) == bad)
+        found = repeated(lambda: servos(emulated.port), lambda found: levels(found) == bad)
     # A bad line may hide servos too.
     assert levels(found) == bad or name == 'line' and levels(found).items() > bad.items()
     assert asked <= {1, 2}      # ping and read: no register is written

@@ -130,8 +130,7 @@ def test_only_answers_to_own_requests_count_and_only_once(board):
 
 def test_the_voltage_filter_depends_on_time_and_not_on_message_count(board):
     def measure(volts, now):
-        tell(board, 147, (-1, -1, 0, round(1000 * volts), *[65535] * 9,
-                                              0, 0, 0, 1, -1), now)
+        tell(board, 147, (-1, -1, 0, round(1000 * volts), *[65535] * 9, 0, 0, 0, 1, -1), now)
 
     measure(25.0, 10.0)
     assert board.voltage == 25.0

@@ -50,8 +50,7 @@ class FakeBus:
 
 def make(**options):
     bus, clock, seen = FakeBus(), SimpleNamespace(now=100.0), []
-    loop = ServoLoop(bus, seen.append, clock=lambda: clock.now,
-                     **options)
+    loop = ServoLoop(bus, seen.append, clock=lambda: clock.now, **options)
     return loop, bus, clock, seen
 
 

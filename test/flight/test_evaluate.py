@@ -148,7 +148,7 @@ def test_ctrl_c_keeps_what_was_flown_and_marks_it(poses, tmp_path, capsys, inter
         *(f'files: {file}' for file in (bags / 'hover', bags / 'own', result))]
     assert printed.err == 'beetle_omni: error: interrupted\n'
     first, second = (read_bag(bags / name) for name in ('hover', 'own'))
-    assert not (first.warnings or second.warnings)
+    assert not first.warnings and second.warnings == ['interrupted; kept what was flown']
     assert 'interrupted' not in first.meta and second.meta['interrupted']
     results = json.loads(result.read_text())
     assert results['meta']['interrupted'] and results['hover']['success_rate'] == 1

@@ -220,8 +220,7 @@ def test_undescribed_modules_load_joints_as_described_ones_of_equal_moment_and_i
 def test_a_servo_sags_under_a_module_that_hangs_beside_its_axis(sets, base, moment):
     k, gravity = 800, 9.8
     zero, one = np.zeros((k, 1, 4)), np.ones((k, 1, 4))
-    windows = Windows(zero[0], zero[0], zero, zero, P.servo_step, 0, 8,
-                      (gravity * one, zero))
+    windows = Windows(zero[0], zero[0], zero, zero, P.servo_step, 0, 8, (gravity * one, zero))
     robot = replace(ROBOT, effects={'module_reaction': {'module_inertia': 0.0,
                                                         'mass_moment': base}})
     shown = simulate(robot, windows, np.zeros((1, k, 1, 4)), [0], [sets], 0.0)[0, -1, 0]

@@ -56,8 +56,7 @@ def test_intervals_hold_the_true_surface_ratio_and_drift(tmp_path):
         inside['drift'].append(within(results['temperature'], 0.002))
         inside['ratio'].append(within(results['torque_to_thrust_ratio'], RATIO))
         model = identified(tmp_path, stand(rng), STAND)
-        limits = np.array([interval(one) for one in
-                           model.surfaces['thrust'].at(duty, voltage)])
+        limits = np.array([interval(one) for one in model.surfaces['thrust'].at(duty, voltage)])
         inside['thrust'] += list((limits[:, 0] < true) & (true < limits[:, 1]))
         assert np.ptp(limits, axis=1).max() < 0.7
     assert all(np.mean(hits) > 0.8 for hits in inside.values()), inside

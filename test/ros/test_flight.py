@@ -96,7 +96,8 @@ def loses_one_node_after_another(graph, witness, bag):
         flight.spin(0.0)
 
 
-def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
+def test_a_signal_ends_a_flight_cleanly_and_the_bag_says_so(tmp_path, number):
     task, bag, temporary = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'tmp'
     task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
     temporary.mkdir()
@@ -111,21 +112,25 @@ def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.2)
         for _ in range(2):
-            process.send_signal(signal.SIGTERM)
+            process.send_signal(number)
             time.sleep(0.1)
-        printed, error = process.communicate(timeout=60)
+        printed, error = process.communicate(timeout=60)    # also of the nodes
     finally:
         process.kill()
         process.communicate()
-    assert not list(temporary.iterdir())
-    first, *lines = printed.splitlines()
+    kept, (first, *lines) = 'interrupted; kept what was flown', printed.splitlines()
     assert first.startswith('to watch: beetle_omni view --domain-id ')
-    assert 'interrupted at ' in printed and lines[-5:-2] == [
-        'interrupted; kept what was flown', f'files: {bag}', f"files: {bag / 'nodes.log'}"]
-    assert error == 'beetle_omni: error: interrupted\n'
-    assert process.returncode == 130
+    if number == signal.SIGTERM:
+        assert not list(temporary.iterdir()) and process.returncode == 130
+        assert 'interrupted at ' in printed and kept in lines
+        assert lines[-4:-2] == [f'files: {bag}', f"files: {bag / 'nodes.log'}"]
+        assert error == 'beetle_omni: error: interrupted\n'
+    while not (bag / 'metadata.yaml').exists():     # the nodes outlive a killed `fly`
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
     log = read_bag(bag)
-    assert not log.warnings and log.states[-1] == 'flying:nmpc' and log.meta['interrupted']
+    assert log.warnings == [kept] and log.states[-1] == 'flying:nmpc' and log.meta['interrupted']
+    assert log.meta['task'] == str(task)
     assert any(b'/observer/force' in file.read_bytes() for file in bag.glob('*.mcap'))
     result = metrics(log, make_task(str(tmp_path / 'poses.csv')))
     assert not result['crashed'] and len(result['poses']) < 10

@@ -36,8 +36,7 @@ def flat_flight(like: TableFlight, position: np.ndarray, yaw: np.ndarray) -> Tab
     rate = turning(axes.as_quat(), h)
     force = np.stack([np.zeros(n), np.zeros(n), np.linalg.norm(felt, axis=1)], axis=1)
     torque = robot.inertia * np.gradient(rate, h, axis=0) + np.cross(rate, robot.inertia * rate)
-    thrust = np.column_stack([robot.mass * force[:, 2], torque]) @ np.linalg.inv(
-        mixer(robot)).T
+    thrust = np.column_stack([robot.mass * force[:, 2], torque]) @ np.linalg.inv(mixer(robot)).T
     thrust += robot.rotors.time_constant * np.gradient(thrust, h, axis=0)   # before the lag
     known = {'position': position, 'quaternion': axes.as_quat(), 'velocity': velocity,
              'acceleration': acceleration, 'specific_force': force, 'angular_velocity': rate,

@@ -62,8 +62,7 @@ def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str
 
 def _about(meta):
     """Flights and robot file in one line."""
-    parts = {'flights': meta['runs'], 'held out': meta['holdout'],
-             'robot file': [meta['robot']]}
+    parts = {'flights': meta['runs'], 'held out': meta['holdout'], 'robot file': [meta['robot']]}
     return '; '.join(f'{word}: {", ".join(runs)}' for word, runs in parts.items() if runs)
 
 

@@ -280,8 +280,7 @@ def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
            if engine.channels[c].split('_')[0] not in engine.without_motion]
     if solution.banned or not own:
         return []
-    left = [found.at(fitted(engine, solution, k))
-            for k, found in enumerate(solution.spectra)]
+    left = [found.at(fitted(engine, solution, k)) for k, found in enumerate(solution.spectra)]
     rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
             line(solution.spectra, left, engine.channels, own)]
     return sorted(rows, key=lambda row: row.probability)

@@ -176,8 +176,7 @@ def module_load(signals: Signals, theta: dict[str, float]) -> np.ndarray:
     outward, _, up = module.centre_of_mass
     for i, axis in enumerate(robot.tilt_axes):
         normal = _normal(axis, tilt[:, i:i + 1])
-        place = robot.rotors.positions[i] + (outward - module.rotor_offset) * axis \
-            + up * normal
+        place = robot.rotors.positions[i] + (outward - module.rotor_offset) * axis + up * normal
         pull = -module.mass * up * np.cross(normal, _felt(signals, theta, place)) @ axis
         load[:, i] = pull - module.inertia[0] * turning @ axis
     return load

@@ -92,8 +92,7 @@ def read_rotor_log(path: str | Path, columns: Mapping[str, tuple[str, float]] | 
     table, rows = read_table(path, lambda header: _wanted(header, columns or {}, source), EXPECTED)
     if len(rows) < LEAST_ROWS:
         raise LogError(f'{path}: {len(rows)} rows are too few; expected at least {LEAST_ROWS}')
-    data = {name: table[column] * (factor or 1)
-            for name, (column, factor) in source.items()}
+    data = {name: table[column] * (factor or 1) for name, (column, factor) in source.items()}
     for name, low, high in (('thrust', -LARGEST_FORCE / 10, LARGEST_FORCE),
                             ('torque', -LARGEST_TORQUE, LARGEST_TORQUE), ('duty', *DUTY)):
         bad = np.flatnonzero((data.get(name, low) < low) | (data.get(name, low) > high))

@@ -122,8 +122,7 @@ class Servos:
         self.noise = [Drifting(len(rows)) for rows in self.rows]
         kinds = kinds_of_motion([(self.logs[k], j, self.rows[k]) for k, j, _ in self.units],
                                 KINDS)
-        self.blocks = [kind + KINDS * k for kind, (k, *_) in zip(kinds, self.units,
-                                                                    strict=True)]
+        self.blocks = [kind + KINDS * k for kind, (k, *_) in zip(kinds, self.units, strict=True)]
         # Each log is predicted from the others, or each kind of motion of one or two logs. A log
         # need not show every kind.
         self.folds = np.arange(1 + max(block.max() for block in self.blocks)) // (
