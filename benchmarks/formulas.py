@@ -173,6 +173,11 @@ def correlation(true, found):
     return float((a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-9))
 
 
+def share(true, found):
+    """Of the power of a true wrench (N, 6) that a found one explains."""
+    return float(1 - ((true - found)**2).sum() / max((true**2).sum(), 1e-9))
+
+
 def with_formula(robot, found):
     """The robot with a formula, term -> coefficient."""
     return replace(robot, effects={'formula': {
@@ -247,8 +252,9 @@ def compared(case, controller, folder):
             'closure_of_formula': of_formula.get('closure'), 'reason': of_formula.get('reason'),
             'ln_bayes_factor': of_formula.get('ln_bayes_factor'),
             **{f'formula{which}': law for which, law in laws.items()},
-            **{f'correlation{which}': correlation(true, wrench(
-                other, base, flown(other)) - before) for which, other in answers.items()}}
+            **{f'{kind}{which}': of(true, wrench(other, base, flown(other)) - before)
+               for which, other in answers.items()
+               for kind, of in (('correlation', correlation), ('share', share))}}
 
 
 def line(case, row, kept=False):
@@ -256,7 +262,7 @@ def line(case, row, kept=False):
     if 'failure' in row:
         return f'{case.name:42} {row["failure"]}'
     law = ' + '.join(f'{k:.3g} {term}' for term, k in row['formula'].items()) or row['reason']
-    numbers = [row[key] for key in ('force_N', 'correlation', 'correlation_all', 'closure',
+    numbers = [row[key] for key in ('force_N', 'correlation', 'share_all', 'closure',
                                     'ln_bayes_factor')]
     if case.baseline:
         law += f" | baseline {row['correlation_baseline']:.3g}, " \
@@ -273,6 +279,8 @@ def summary(rows):
     return {'cases': len(rows), 'failures': len(rows) - len(own), 'formulas': len(laws),
             'rediscovered': sum(bool(row['correlation'] >= LIKE and row['closure'] >= CLOSED)
                                 for row in laws),
+            'of_true_force': sum(bool(row['correlation'] >= LIKE and row['share_all'] >= CLOSED)
+                                 for row in laws),
             'named_without_formula': sum(bool(row['named']) for row in own if row not in laws),
             'baseline_formulas': sum(bool(row['formula_baseline']) for row in own),
             'baseline_correlated': sum(row['correlation_baseline'] >= LIKE for row in own)}
@@ -299,8 +307,8 @@ def main():
              for k in range(given.cases or (50 if kind == UNDISTURBED else len(names)))]
     calls = [(case._replace(key=digest(repr(case))),) for case in cases]
     console = Console(width=250)
-    console.print(f'{"case":42} by    force [N], correlation of the formula, with the entries '
-                  'named beside it, closure, ln B, these entries | formula')
+    console.print(f'{"case":42} by    force [N], correlation of the formula, share of its power '
+                  'with the entries named beside it, closure, ln B, these entries | formula')
     rows = sweep(examined, calls, store=Store(given.out.with_suffix('')), jobs=given.jobs,
                  console=console, line=line)
     counts = {kind: summary(own) for kind in KINDS if (

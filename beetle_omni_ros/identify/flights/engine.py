@@ -66,11 +66,19 @@ class Engine(Linearised):
                          for k in range(len(self.flights))])
         etas[:, :self.known][:, self.curved] = 0.0
         theta = np.zeros(len(self.names))
-        theta[:self.known] = solution.theta[:self.known]
-        theta[:self.known][self.curved] = 0.0
-        own = self.indices(solution.best)
-        theta[own] = solution.theta[own]
+        theta[:self.known] = self.point_of(solution, solution.theta)
         return self._restarted(theta, etas, solution.spectra), etas
+
+    def point_of(self, solution: Solution, theta: np.ndarray) -> np.ndarray:
+        """
+        Known keys of ``theta`` (K,) at which flights can be computed.
+
+        Starts that are not in the best set have slopes, but must not act.
+        """
+        point, own = theta[:self.known].copy(), self.indices(solution.best)
+        point[self.curved] = 0.0
+        point[own] = theta[own]
+        return point
 
     def _steady(self, spectra):
         """

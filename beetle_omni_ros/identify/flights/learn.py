@@ -27,6 +27,7 @@ from beetle_omni_ros.model.schema import ParameterError
 
 FORMULA = 'formula'
 MOST = 3                # terms
+NOTHING = 1e-6          # of a prior deviation: the key keeps its value
 CLOSED = 0.5            # least closure on the held-out flights
 RANGE = 0.02, 0.98      # quantiles of the motion that are stated
 
@@ -87,6 +88,10 @@ def _formula(terms, before, engine, solution, result, starts, judges):
     more = min(gain(chosen, other) for other in (rest, known, rest | known))
     if more < log(1 / engine.alpha):
         return 'it would not be more probable than the entries of the catalogue'
+    # the other terms are no part of the model, neither as tolerances nor where noise is learnt
+    for deviations in (engine.narrow, engine.typical):
+        deviations[engine.indices([k for k, entry in enumerate(entries)
+                                   if entry.name == FORMULA and k not in own])] *= NOTHING
     solution = engine.again(solution, chosen)
     at, after, floor, closure = errors(engine, solution, own, judges)
     if closure is None or closure < CLOSED:

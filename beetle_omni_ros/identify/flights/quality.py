@@ -66,14 +66,15 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
     """
     Whitened RMS of flights without and with the named entries, and of a fit; closure.
 
-    Tolerances of the robot are as fitted, so that they count neither before nor after. The
-    last fit adapts everything to these flights, within the priors.
-    The flights' own deviations are fitted within their priors in each case. The noise is that
-    of the fitted flights.
+    Tolerances of the robot are as fitted, so that they count in none of the three: fitted again,
+    they would explain the noise of these flights. The last fit adapts the named entries and the
+    discrepancy to these flights. Their own deviations are fitted within their priors in each case.
+    The noise is that of the fitted flights.
     """
-    theta = np.concatenate([solution.theta[:engine.known],
-                            np.zeros(len(engine.names) - engine.known)])
-    spectra, fitted = engine.others(flights, theta)
+    theta, point = (np.concatenate([known, np.zeros(len(engine.names) - engine.known)])
+                    for known in (solution.theta[:engine.known],
+                                  engine.point_of(solution, solution.theta)))
+    spectra, fitted = engine.others(flights, point)
     noise, total, count = pooled(solution.spectra), np.zeros(3), 0
     less = theta.copy()
     less[engine.indices(named)] = 0.0
@@ -81,7 +82,8 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
     for _, key, column in engine.repeats:
         if not fitted:      # sensors of flights that judge may differ from those of the others
             own[key] = engine.typical[column]
-    every = np.hypot(engine.narrow, own)
+    every = own.copy()
+    every[engine.known:] = np.hypot(engine.narrow, own)[engine.known:]
     every[engine.indices(named)] += 9 * engine.typical[engine.indices(named)]
     for each in spectra:
         each.noise = noise
@@ -115,13 +117,14 @@ def where_of(engine: Engine, solution: Solution) -> list[dict]:
     without discrepancy, and ``rms``, ``rms_after`` and ``discrepancy_rms`` of what repeats and is
     in no entry, with a unit.
     """
-    known, whitened, raw = engine.known, [], []
+    whitened, raw = [], []
     for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
         x = fitted(engine, solution, k)
         whitened.append([(rest / noise_of(found)).reshape(-1, len(engine.channels))
                          for rest in (found.residual, found.at(x))])
         raw.append([np.where(flight.mask, flight.linear(at, []).residual, np.nan)
-                    for at in ({}, dict(zip(engine.names[:known], x, strict=False)))])
+                    for at in ({}, dict(zip(engine.names, engine.point_of(solution, x),
+                                            strict=False)))])
     excess, rms = (np.sqrt([np.nanmean(np.concatenate(parts)**2, axis=0)
                             for parts in zip(*own, strict=True)]) for own in (whitened, raw))
     rows: list[dict] = [

@@ -102,7 +102,8 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
                     kept=frozenset(kept), clock=IMU_LAG, curved=frozenset({*starts, *tangents}))
     solution = engine.run({'joint_command_latency.delay': late})
     for model in others:
-        model.settle(dict(zip(engine.names[:engine.real], solution.theta, strict=False)))
+        model.settle(dict(zip(engine.names, engine.point_of(solution, solution.theta)[
+            :engine.real], strict=False)))
     result = concluded(engine, solution, keys, others or models, BAG_GROUPS, starts=starts,
                        held_out=bool(judging))
     return result | then(engine, solution, result, starts, others or models) if then else result
