@@ -13,6 +13,7 @@ from beetle_omni_ros.identify.flights.linearised import FORM, GROUPS, Linearised
 from beetle_omni_ros.identify.flights.spectrum import EDGES, Spectrum
 
 ROUNDS, MOST_ROUNDS = 3, 6      # linearisations; more until the best set and its values stay
+NEAR_START = 0.1        # share of a start within which an effect without a slope is nearly linear
 MOST = 8                # entries of a set
 PAIRED = 20             # entries whose pairs are all weighed; others follow from the best set
 
@@ -27,6 +28,7 @@ class Engine(Linearised):
             theta[self.index[name]] = value
         etas = np.zeros((len(self.flights), len(self.names)))
         self._whiten(theta, etas)
+        self.only_acting = False
         spectra: list[Spectrum] = []
         best, turn = None, 0
         while True:
@@ -38,9 +40,22 @@ class Engine(Linearised):
                 np.abs(solution.theta[own] - theta[own]) <= self.typical[own])[
                     ~self.curved[own]].all()
             if turn == MOST_ROUNDS or turn >= ROUNDS and stays:
-                return self._with_plain(solution)
+                return self._with_plain(self._acting(solution))
             best = solution.best
             theta, etas = self._next(solution)
+
+    def _acting(self, solution):
+        """
+        The solution; if it has a start far from where it acts, that of a search at its value.
+
+        What an effect without a slope does far from its start is not known there.
+        """
+        own = np.array(self.indices(solution.best), dtype=int)
+        own = own[self.curved[own]]
+        if (np.abs(solution.theta[own] - self.point[own]) <= NEAR_START).all():
+            return solution
+        self.only_acting = True
+        return self._steady(self.again(solution, solution.best).spectra)
 
     def again(self, solution: Solution, chosen: tuple[int, ...]) -> Solution:
         """The set ``chosen``, linearised at its own values; nothing is searched."""
@@ -117,7 +132,9 @@ class Engine(Linearised):
         # of the variants of an entry, the one that explains most alone
         variants: dict[tuple, int] = {}
         for k in (k for k in range(total) if k not in banned):
-            entry = self.entries[k]
+            entry, first = self.entries[k], self.index[self.entries[k].keys[0]]
+            if self.only_acting and self.curved[first] and not self.acting[first]:
+                continue
             same = entry.name, entry.member, entry.varying
             if same not in variants or weight((k,)) > weight((variants[same],)):
                 variants[same] = k
