@@ -2,9 +2,8 @@
 Formulas of `gap --learn` against hidden forces: ``python benchmarks/formulas.py --seed 0``.
 
 Each body and rotor entry is left out of the catalogue and hidden in three flights, and so are ten
-families outside it; undisturbed plants have no law. True force and formula follow from the true
-states of the third flight, which no fit has seen. ``--baseline`` adds plain sparse regression of
-the same terms (pysindy). The same command continues an interrupted run.
+families outside it; undisturbed plants have no law. True states of the third flight judge.
+``--baseline`` adds plain sparse regression (pysindy). The same command continues a run.
 """
 
 from __future__ import annotations
