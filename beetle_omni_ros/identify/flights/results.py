@@ -349,8 +349,8 @@ def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
         return 'unknown', rest[0].sentence
     if chance > alpha:
         return 'no_gap', ''
-    return 'not_decidable', ('an effect is more likely than none, but a false alarm would have '
-                             f'the probability {chance:.2g}')
+    return 'not_decidable', (f'an effect is more likely than none (probability of a false alarm '
+                             f'{chance:.2g}), but none is sure enough by itself')
 
 
 def varied(engine: Engine, solution: Solution) -> list[str]:
