@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.flights import discrepancy
 from beetle_omni_ros.identify.flights.discrepancy import of_thrusts
-from beetle_omni_ros.identify.flights.quality import line, repeatable
+from beetle_omni_ros.identify.flights.quality import line, repeatable, Unexplained
+from beetle_omni_ros.identify.flights.results import verdict_of
 from beetle_omni_ros.identify.flights.spectrum import spectrum
 from beetle_omni_ros.model.parameters import RobotParameters
 
@@ -96,3 +97,10 @@ def test_a_vibration_is_a_line_of_its_frequency_in_flights_of_any_length():
     found = both_tests((3, 4), extra=shaking)[1]
     assert found.probability < 1e-6 and found.channels[0] == 'force_y'
     assert found.frequency == pytest.approx(5.3, abs=0.06)
+
+
+@pytest.mark.parametrize(('evidence', 'chance', 'verdict'), [
+    (9.0, 0.002, 'unknown'), (11.0, 0.002, 'named'), (9.0, 0.03, 'named')])
+def test_a_name_with_a_tenth_of_what_repeats_unexplained_is_only_a_part(evidence, chance, verdict):
+    rest = [Unexplained('repeatable', chance, 100.0, CHANNELS)]
+    assert verdict_of(1e-4, [['wind']], rest, [], 0.05, evidence)[0] == verdict

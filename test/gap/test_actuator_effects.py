@@ -7,8 +7,10 @@ from flights import KEYS, model, Motion, P, ROBOT, solved, STEP
 import numpy as np
 import pytest
 
+from beetle_omni_ros.identify.flights import engine as engine_module
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.keys import Entry, Prior
+from beetle_omni_ros.identify.flights.quality import errors
 from beetle_omni_ros.identify.flights.results import effect_of
 from beetle_omni_ros.identify.flights.servo import (
     module_load,
@@ -184,20 +186,40 @@ def test_a_torque_limit_is_recovered_from_samples_at_the_limit():
     assert KEYS[key].value(found[key]) == pytest.approx(0.05, abs=0.003)
 
 
-@pytest.mark.parametrize('factor', [0.1, 0.3, 0.7])
-def test_a_torque_limit_keeps_its_value_when_it_is_linearised_again(factor):
-    made, key = model(flight(servo(effort=0.05))), KEYS['joint_torque_limit.effort_limit']
-    start, tangent = 'joint_torque_limit@0', 'joint_torque_limit@0~joint_torque_limit.effort_limit'
-    made.starts = {start: {key.name: starts_of(key, [made])[0][0] + np.log(factor)}}
-    made.tangents = {tangent: (start, key.name)}
+def engine_of(made, starts):
+    """Engine of the joints of a flight with these starts, name -> key -> value."""
+    made.starts = starts
+    made.tangents = {f'{start}~{key}': (start, key)
+                     for start, own in starts.items() for key in own}
     # four blocks; the forces of these readings are not those of the thrusts
-    engine = Engine([made] * 4, {start: Prior(0.03, 1.0, 0.0), tangent: Prior(0.001, 0.3, 0.0)},
-                    [Entry(key.effect, (start, tangent), None, False)], {start: (0.0, np.inf)},
-                    curved=frozenset({start, tangent}))
+    return Engine([made] * 4, dict.fromkeys(starts, Prior(0.03, 1.0, 0.0))
+                  | dict.fromkeys(made.tangents, Prior(0.001, 0.3, 0.0)),
+                  [Entry(start.partition('@')[0], (start, *(f'{start}~{key}' for key in own)),
+                         None, False) for start, own in starts.items()],
+                  dict.fromkeys(starts, (0.0, np.inf)),
+                  curved=frozenset({*starts, *made.tangents}))
+
+
+@pytest.mark.parametrize(('factor', 'rounds'), [(0.1, 6), (0.3, 6), (0.7, 6), (0.5, 1)])
+def test_a_torque_limit_keeps_its_value_when_it_is_linearised_again(factor, rounds, monkeypatch):
+    # with one round, the search ends far from where the limit acts
+    monkeypatch.setattr(engine_module, 'MOST_ROUNDS', rounds)
+    made, key = model(flight(servo(effort=0.05))), KEYS['joint_torque_limit.effort_limit']
+    engine = engine_of(made, {'joint_torque_limit@0': {
+        key.name: starts_of(key, [made])[0][0] + np.log(factor)}})
     solution = engine.run()
     assert solution.best == (0,)
     stated = effect_of(solution, engine, KEYS, 0, [0], made.starts)['parameters']['effort_limit']
     assert stated['value'] == pytest.approx(0.05, rel=0.03)
+
+
+def test_starts_that_are_not_named_do_not_act_in_the_flights_that_judge():
+    engine = engine_of(model(flight(servo(coulomb=0.008, stiction=0.008))), {
+        f'joint_friction@{k}': {'joint_friction.coulomb': size, 'joint_friction.stiction': size}
+        for k, size in enumerate((0.003, 0.008, 0.02))})
+    solution = engine.run()
+    assert solution.best == (1,) and solution.theta[engine.index['joint_friction@2']] != 0
+    assert errors(engine, solution, [1], engine.flights)[3] > 0.9
 
 
 DESCRIBED = RobotParameters.load()

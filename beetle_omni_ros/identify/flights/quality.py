@@ -71,9 +71,9 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
     discrepancy to these flights. Their own deviations are fitted within their priors in each case.
     The noise is that of the fitted flights.
     """
-    theta, point = (np.concatenate([known, np.zeros(len(engine.names) - engine.known)])
-                    for known in (solution.theta[:engine.known],
-                                  engine.point_of(solution, solution.theta)))
+    generic = np.zeros(len(engine.names) - engine.known)
+    theta = np.concatenate([solution.theta[:engine.known], generic])
+    point = np.concatenate([engine.point_of(solution, solution.theta), generic])
     spectra, fitted = engine.others(flights, point)
     noise, total, count = pooled(solution.spectra), np.zeros(3), 0
     less = theta.copy()
@@ -83,7 +83,7 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
         if not fitted:      # sensors of flights that judge may differ from those of the others
             own[key] = engine.typical[column]
     every = own.copy()
-    every[engine.known:] = np.hypot(engine.narrow, own)[engine.known:]
+    every[engine.known:] = engine.narrow[engine.known:]
     every[engine.indices(named)] += 9 * engine.typical[engine.indices(named)]
     for each in spectra:
         each.noise = noise

@@ -321,7 +321,7 @@ def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: li
 
 
 def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
-               fed_back: list[str], alpha: float, evidence: float = 0.0) -> tuple[str, str]:
+               fed_back: list[str], alpha: float, evidence: float) -> tuple[str, str]:
     """
     Verdict on flights and, without names, its reason as the end of a sentence.
 
