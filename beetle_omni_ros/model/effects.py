@@ -72,6 +72,10 @@ def wind(terms, force):
     terms.force_world = terms.force_world + vector(force)
 
 
+def wind_velocity(terms, velocity):
+    terms.velocity = terms.velocity - vector(velocity)
+
+
 def body_drag(terms, coefficient):
     speed = ca.sqrt(ca.sumsqr(terms.velocity) + 1e-12)
     terms.force_world = terms.force_world - coefficient * speed * terms.velocity
@@ -210,6 +214,12 @@ CATALOGUE: dict[str, Effect] = {
         'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0)},
         'f_i (1 + g (0.25 m / h)^2 n_z^2) after Cheeseman and Bennett 1955; h: rotor above the '
         'floor', ground_effect),
+    'wind_velocity': Effect(
+        'body', {'velocity': EffectParameter('m/s', (0.0,) * 3, -50, 50)},
+        'drag, inflow and lift by the velocity v - w against air that moves by w in world '
+        '(Mahony et al. 2012)', wind_velocity, beside=(
+            'rotor_drag', 'rotor_hub_moment', 'body_drag', 'axial_inflow', 'translational_lift',
+            'formula')),
     'rotor_drag': Effect(
         'body', {'coefficient': EffectParameter('N s/m', 0.0, 0.0, 5.0)},
         'H-force of Faessler et al. 2018, in the rotor plane, grows with rotor speed '
@@ -354,6 +364,9 @@ def validated(effects: dict) -> dict[str, dict]:
                                  f'found {quoted(given)}')
         checked[name] = {key: _value(f'effects.{name}.{key}', spec, given.get(key, spec.default))
                          for key, spec in entry.parameters.items()}
+        if entry.beside and not set(entry.beside) & set(effects):
+            raise ParameterError(f'effects.{name}: expected one of the effects '
+                                 f"{', '.join(entry.beside)} beside it, by which it acts")
         if entry.each == 'term' and len({len(value) for value in checked[name].values()}) > 1:
             raise ParameterError(f'effects.{name}: expected one coefficient for each expression')
     return checked

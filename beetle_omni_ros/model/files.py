@@ -6,6 +6,7 @@ import gzip
 import json
 from math import isfinite
 from pathlib import Path
+import re
 
 import numpy as np
 
@@ -20,7 +21,8 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
     """
     Read columns of a CSV file, plain or compressed by gzip.
 
-    Blank lines, comments (#) and further columns are ignored.
+    Blank lines, comments (#) and further columns are ignored. A column ``a`` whose cells are lists
+    of numbers, as pandas writes arrays, is the columns ``a[0]``, ``a[1]`` and so on.
 
     Args:
         path: path of the file.
@@ -47,8 +49,8 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
     except (OSError, EOFError, UnicodeDecodeError, csv.Error) as cause:
         reason = f"not a CSV text file ({getattr(cause, 'strerror', None) or cause})"
         raise ParameterError(f'{path}: {reason}') from None
-    lines = [(number, row) for number, row in lines
-             if any(row) and not row[0].startswith('#')]
+    lines = _spread([(number, row) for number, row in lines
+                     if any(row) and not row[0].startswith('#')])
     if not lines:
         raise ParameterError(f'{path}: empty; expected the header {expected}')
     number, header = lines.pop(0)
@@ -73,6 +75,21 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
     table = np.array(values).reshape(len(lines), len(names))
     return ({name: table[:, k] for k, name in enumerate(names)},
             np.array([line for line, _ in lines], dtype=int))
+
+
+def _spread(lines):
+    """Rows in which a cell with a list is a cell for each element."""
+    first = lines[1][1] if len(lines) > 1 else []
+    lists = {k: cell.count(',') + 1 for k, cell in enumerate(first) if cell.startswith('[')}
+    if not lists:
+        return lines
+    (number, header), *rows = lines
+    header = [part for k, name in enumerate(header) for part in (
+        [f'{name}[{j}]' for j in range(lists[k])] if k in lists else [name])]
+    return [(number, header), *((number, [
+        part for k, cell in enumerate(row) for part in (
+            re.split(r',\s*', re.sub(r'[\[\]]', '', cell)) if k in lists else [cell])])
+        for number, row in rows)]
 
 
 def _unusable(row, header, index, gaps):

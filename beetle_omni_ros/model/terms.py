@@ -138,6 +138,7 @@ class Effect:
     # Delayed quantities: 'tilt' and 'thrust' commands, readings of 'imu', 'mocap', 'encoders'.
     delays: tuple[str, ...] = ()
     allocated: bool = False     # the allocation includes it
+    beside: tuple[str, ...] = ()    # it acts by another effect, one of these
     measured: tuple[str, ...] = ()  # terms of MEASURED; where one is None, it is left out
     # Name of CONSUMERS -> why it ignores the effect, where this does not follow from its kind.
     ignored_by: dict[str, str] = field(default_factory=dict)

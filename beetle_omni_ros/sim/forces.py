@@ -91,6 +91,11 @@ def wind(at, force):
     at.force_world = at.force_world + np.array(force)
 
 
+def wind_velocity(at, velocity):
+    """Velocity against the air (Mahony et al. 2012)."""
+    at.velocity = at.velocity - np.array(velocity)
+
+
 def body_drag(at, coefficient):
     """F = -c |v| v."""
     speed = np.sqrt(at.velocity.dot(at.velocity))
@@ -155,9 +160,9 @@ def voltage_sag(at, exponent):
 
 
 LAWS = {law.__name__: law for law in (
-    joint_offset, wind, body_drag, rotor_drag, rotor_hub_moment, axial_inflow, translational_lift,
-    tilt_thrust_loss, ground_effect, propeller_gyroscopic_torque, rotor_acceleration_torque,
-    voltage_sag)}
+    joint_offset, wind, wind_velocity, body_drag, rotor_drag, rotor_hub_moment, axial_inflow,
+    translational_lift, tilt_thrust_loss, ground_effect, propeller_gyroscopic_torque,
+    rotor_acceleration_torque, voltage_sag)}
 
 
 class AddedForces:

@@ -136,13 +136,14 @@ def motor_volts(thrust):
 
 
 def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0, late=0.0, bias=0.0,
-                 wander=0.002):
+                 wander=0.002, wind=(0.0, 0.0, 0.0)):
     """
     A flight in the columns of NanoBench, from equations of its own.
 
     The motion is prescribed; attitude and commands are those that it needs. Thrust by motor
     voltage with a lag of 60 ms. MoCap is ``late`` (a number or (N,)) [s], and the accelerometer
-    has a vertical ``bias`` [m/s^2] and a random walk of ``wander`` a sample.
+    has a vertical ``bias`` [m/s^2] and a random walk of ``wander`` a sample. ``wind`` is a force
+    in world [N].
     """
     rng = np.random.default_rng(seed)
     t = np.arange(-1, seconds + 1, 0.01)        # derivatives at the ends are cut off
@@ -156,7 +157,7 @@ def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0, late=0
         size = np.linalg.norm(thrust, axis=1, keepdims=True)
         up = thrust / size
         in_plane = v - up * (up * v).sum(axis=1, keepdims=True)
-        thrust = need + drag * np.sqrt(size / (0.0319 * 9.81)) * in_plane
+        thrust = need - wind + drag * np.sqrt(size / (0.0319 * 9.81)) * in_plane
     left = np.cross(up, [1, 0.3, 0])
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     matrix = np.stack([np.cross(left, up), left, up], axis=2)
@@ -213,6 +214,44 @@ def test_a_hidden_thrust_and_drag_are_named_with_their_sizes(tmp_path, capsys):
     *_, then, last = capsys.readouterr().out.splitlines()
     assert then == f'next:  open {page} in a browser' and '--report' not in last
     assert last.startswith('next:  the same with --apply FILE')
+
+
+@pytest.fixture
+def by_mocap(tmp_path):
+    """Makes flights that begin in the air, and gives results from their positions alone."""
+    form = tmp_path / 'mocap.yaml'
+    form.write_text(''.join(
+        line for line in share_path('params/formats/nanobench.yaml').read_text().splitlines(True)
+        if not line.startswith('specific_force')).replace('clock: radio', 'clock: mocap'))
+
+    def result(seeds, **effect):
+        flights = [write_flight(tmp_path / f'{k}.csv', k, **effect) for k in seeds]
+        for k, flight in enumerate(flights):
+            rows = np.loadtxt(flight, delimiter=',', skiprows=1)[200:]
+            rows[:, 1:8] += np.random.default_rng(k).normal(size=(len(rows), 7)) * 2e-4
+            np.savetxt(flight, rows, delimiter=',', header=HEADER, comments='', fmt='%.7g')
+        return gap_of(flights, str(form))
+    return result
+
+
+def test_without_accelerometer_positions_show_the_forces(by_mocap):
+    result = by_mocap(range(3), scale=0.8, drag=0.012)
+    assert result['groups']['force']['channels'] == ['force_x', 'force_y', 'force_z']
+    assert 'no accelerometer' in result['groups']['acceleration']['reason']
+    found = {effect['names'][0]: effect['parameters'] for effect in result['effects']}
+    assert set(found) == {'thrust_coefficient', 'rotor_drag'}
+    for name, key, true in (('thrust_coefficient', 'scale', 0.8),
+                            ('rotor_drag', 'coefficient', 0.012)):
+        low, high = found[name][key]['interval']
+        assert low <= true <= high
+    assert not by_mocap(range(10, 12))['effects']
+
+
+def test_a_wind_of_a_fifth_of_the_weight_is_not_taken_for_markers_that_are_turned(by_mocap):
+    result = by_mocap(range(2), wind=(0.05, -0.03, 0.0))
+    assert named(result) == {'wind'}
+    force = result['effects'][0]['parameters']['force']['value']
+    assert np.allclose(force, [0.05, -0.03, 0.0], atol=0.004)
 
 
 def test_flights_of_the_robot_of_the_file_have_no_named_effect(tmp_path):

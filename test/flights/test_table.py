@@ -49,6 +49,20 @@ def test_empty_cells_and_lost_rows_are_samples_that_do_not_exist(tmp_path):
     assert not np.isnan(table.values['duty'][13]).any()
 
 
+def test_the_elements_of_lists_in_a_cell_are_columns(tmp_path):
+    path = tmp_path / 'flight.csv'
+    path.write_text(',t,p,v,q,R,w,pwm,p_d\n' + ''.join(
+        f'{k},{0.02 * k},"[{k}.5, -1, 2e-1]","[1, 2, 3]","[0, 0, 0, 1]","[[1, 0], [0, 1]]",'
+        '"[0, 0, nan]","[500, 600, 700, 1000]","[0, 0, 0]"\n' for k in range(12)))
+    values = read_flight(path, Format.load('neural_fly')).values
+    assert np.allclose(values['position'][3], [3.5, -1, 0.2])
+    assert np.allclose(values['duty'][0], [0.25, 0.3, 0.35, 0.5])
+    assert np.isnan(values['angular_velocity'][:, 2]).all()
+    path.write_text(path.read_text().replace('[4.5, -1, 2e-1]', '[4.5, -1]'))
+    with pytest.raises(ParameterError, match='flight.csv: row 6'):
+        read_flight(path, Format.load('neural_fly'))
+
+
 @pytest.mark.parametrize('text, message', [
     ('duty: {columns: [a, b, c, d]}', "'time' is missing"),
     ('time: {columns: [t], unit: h}', "'unit': expected one of s, ms, us, ns, found 'h'"),

@@ -1,10 +1,14 @@
 """Each body effect, added to the readings by an independent formula, is recovered."""
 
+from dataclasses import replace
+
 from flights import KEYS, model, Motion, ROBOT, solved
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from beetle_omni_ros.identify.flights.body import BodyModel
+from beetle_omni_ros.identify.flights.keys import all_keys, extra_keys
 from beetle_omni_ros.model.effects import CATALOGUE
 
 MOTION = Motion()
@@ -166,7 +170,20 @@ def test_a_wind_is_recovered_in_world_axes(made):
     assert np.allclose([found[name] for name in names], true, rtol=0.01, atol=0.01)
 
 
+def test_a_wind_velocity_moves_the_drag_and_has_no_key_without_one():
+    true, names = np.array([2.0, -3.0, 0.5]), [f'wind_velocity.velocity[{k}]' for k in range(3)]
+    assert not set(names) & set(KEYS)
+    robot = replace(ROBOT, effects={'rotor_drag': {'coefficient': 0.4}})
+    keys = {**all_keys(robot), **extra_keys()}
+    made = model(MOTION.flight(), robot, BodyModel(robot, keys, (0.0, 0.0)), keys)
+    air = np.tile(MOTION.attitude.inv().apply(true)[:, None], (1, 4, 1))
+    more = on_rotors(0.1 * speeds()[:, :, None] * split(air)[1])     # than the drag in still air
+    found = solved(made, names, 'B', without(made, *more))
+    assert np.allclose([found[name] for name in names], true, rtol=0.01, atol=0.01)
+
+
 def test_every_body_effect_is_tested():
     asked = {name.partition('.')[0] for name in CASES} | {
-        'wind', 'inertia', 'centre_of_mass', 'formula'}  # the last: test_dynamics, test_formula
+        'wind', 'wind_velocity',
+        'inertia', 'centre_of_mass', 'formula'}     # test_dynamics, test_formula
     assert asked >= {name for name, effect in CATALOGUE.items() if effect.apply}

@@ -1,11 +1,13 @@
 """Flights of the package's own simulator: what is there is named, and nothing else."""
 
+import numpy as np
 import pytest
 from rich.console import Console
 import yaml
 
 import beetle_omni_ros
 from beetle_omni_ros.identify.flights.command import gap_results
+from beetle_omni_ros.identify.recording.bag import COMMAND, IMU, JOINTS, POSE, read_recording
 from beetle_omni_ros.model.resources import share_path
 
 
@@ -47,3 +49,36 @@ def test_late_tilt_commands_and_modules_that_load_the_servos_are_named_and_nothi
                        ('mass_moment', -module['mass'] * depth)):
         low, high = effects['module_reaction'][name]['interval']
         assert low < true < high
+
+
+FORMAT = """
+clock_deviation: 0.001
+time: {columns: [t], unit: s}
+position: {columns: [px, py, pz], unit: m}
+quaternion: {columns: [qx, qy, qz, qw], order: xyzw, frame: body_to_world}
+specific_force: {columns: [ax, ay, az], unit: m/s^2}
+angular_velocity: {columns: [wx, wy, wz], unit: rad/s}
+tilt: {columns: [q1, q2, q3, q4], unit: rad}
+thrust: {columns: [f1, f2, f3, f4], unit: N}
+"""
+
+
+def test_a_table_of_a_robot_that_tilts_has_the_forces_of_its_modules(tmp_path):
+    beetle_omni_ros.simulate('nmpc', 'random5', seed=1, bag=tmp_path / 'bag')
+    flight = read_recording(tmp_path / 'bag')
+    t = np.arange(flight.times[POSE][0], flight.times[POSE][-1], 0.01)
+
+    def at(topic, columns):
+        return [np.interp(t, flight.times[topic], column)
+                for column in flight.values[topic][:, columns].T]
+    held = np.searchsorted(flight.times[COMMAND], t - 0.01) - 1     # on the way for 10 ms
+    thrust = flight.values[COMMAND][np.clip(held, 0, None), 4:].T
+    form, table = tmp_path / 'own.yaml', tmp_path / 'flight.csv'
+    form.write_text(FORMAT)
+    np.savetxt(table, np.column_stack([
+        t - t[0], *at(POSE, slice(7)), *at(IMU, slice(6)), *at(JOINTS, slice(4)), *thrust]),
+        delimiter=',', comments='', header='t,px,py,pz,qx,qy,qz,qw,ax,ay,az,wx,wy,wz,'
+                                           'q1,q2,q3,q4,f1,f2,f3,f4')
+    result = gap([table], form=str(form))
+    assert result['groups']['force']['used'] and result['groups']['torque']['used']
+    assert result['verdict'] in ('no_gap', 'not_decidable') and not result['findings']

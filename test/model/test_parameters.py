@@ -128,6 +128,16 @@ def test_an_interval_belongs_to_the_value_of_its_file(tmp_path):
     assert RobotParameters.load(tmp_path / 'effect.yaml').intervals == {}
 
 
+def test_an_effect_that_acts_by_another_one_is_refused_without_any(tmp_path):
+    file = tmp_path / 'mine.yaml'
+    wind = 'wind_velocity: {velocity: [1, 0, 0]}'
+    file.write_text(f'extends: robot.yaml\neffects: {{{wind}, body_drag: {{coefficient: 0.1}}}}\n')
+    assert RobotParameters.load(file).effects['wind_velocity']['velocity'] == (1, 0, 0)
+    file.write_text(f'extends: robot.yaml\neffects: {{{wind}, mass: {{mass: 3.1}}}}\n')
+    with pytest.raises(ParameterError, match=r'mine\.yaml: .*wind_velocity: expected one of'):
+        RobotParameters.load(file)
+
+
 @pytest.mark.parametrize('text', [
     'mass: [4, 5]', 'mass: 3', 'name: [1, 2]', 'effects.wind.force: [0, 1]'])
 def test_an_interval_that_does_not_hold_its_value_is_refused(tmp_path, text):

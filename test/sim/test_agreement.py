@@ -28,6 +28,8 @@ EFFECTS = {
     'torque_coefficient': {'torque_coefficient': {'torque_to_thrust_ratio': 0.021}},
     'joint_offset': {'joint_offset': {'offset': [0.05, -0.1, 0.2, 0.03]}},
     'wind': {'wind': {'force': [1.0, -2.0, 0.5]}},
+    'wind_velocity': {'wind_velocity': {'velocity': [3.0, -2.0, 1.0]},
+                      'body_drag': {'coefficient': 0.11}},
     'body_drag': {'body_drag': {'coefficient': 0.11}},
     'rotor_drag': {'rotor_drag': {'coefficient': 0.4}},
     'rotor_hub_moment': {'rotor_hub_moment': {'coefficient': 0.1}},

@@ -18,6 +18,7 @@ EFFECTS = validated({
     'thrust_coefficient': {'scale': 0.93},
     'rotor_thrust_coefficient': {'scale': [1.0, 0.9, 1.05, 0.97]},
     'torque_coefficient': {'torque_to_thrust_ratio': 0.021}, 'wind': {'force': [1.0, -2.0, 0.5]},
+    'wind_velocity': {'velocity': [2.0, -1.0, 0.3]},
     'body_drag': {'coefficient': 0.11}, 'rotor_drag': {'coefficient': 0.4},
     'rotor_hub_moment': {'coefficient': 0.1},
     'axial_inflow': {'per_rotor': 0.3}, 'translational_lift': {'per_rotor': 0.03},

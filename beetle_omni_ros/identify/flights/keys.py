@@ -47,7 +47,8 @@ VARYING = {'mocap_time_offset.delay': 0.008, 'imu_filter_lag.delay': 0.008,
            'joint_feedback_delay.delay': 0.008, 'imu_accelerometer_bias.bias': 0.1,
            'imu_gyroscope_bias.bias': 0.008, 'imu_misalignment.rotation': 0.005,
            'mocap_misalignment.rotation': 0.005}
-AIR = 0.3               # [m/s] moves in a hall; its force is that of a typical drag
+AIR = 0.3               # [m/s] moves up or down; its force is that of a typical drag
+VERTICAL = 'wind.force[2]', 'wind_velocity.velocity[2]'
 FLIGHT_OFFSET = 0.0033          # share of the arm: centre of mass, repeats of one vehicle
 
 
@@ -132,7 +133,8 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
         effects['joint_friction'] = dict(zip(CATALOGUE['joint_friction'].parameters,
                                              friction(robot), strict=True))
     for name, effect in CATALOGUE.items():
-        if name not in TREATMENTS or ignored('gap', name):
+        if name not in TREATMENTS or ignored('gap', name) or (
+                effect.beside and not set(effect.beside) & set(effects)):
             continue
         treatment = TREATMENTS[name]
         if effect.each == 'term':
@@ -254,8 +256,10 @@ def prior_of(robot: RobotParameters, key: Key, tolerance: float, stamps: float) 
         flight = FLIGHT_OFFSET * ARM * size_of(robot, 'm')
     if plain == 'rotor_dead_time.delay':
         flight = max(flight, stamps)
-    typical = AIR * TREATMENTS['rotor_drag'].sizes['coefficient'].typical if (
-        plain == 'wind.force') else key.typical
+    typical = key.typical
+    if key.name in VERTICAL:
+        drag = TREATMENTS['rotor_drag'].sizes['coefficient'].typical
+        typical = AIR * (drag if plain == 'wind.force' else 1.0)
     return Prior(tolerance or 0.5 * key.smallest * size, typical * size, flight)
 
 

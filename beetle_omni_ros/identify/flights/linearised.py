@@ -185,7 +185,7 @@ class Linearised:
             rest = each.at(fit + equations.of_flight(k, fit))
             bands = {kind: self._hidden(each, own, rest, whole) for kind, own in self._in_loop()}
             if not flight.turning:      # what the model lacks is more than the noise
-                bands = {'torque': bands.get('torque', [])}
+                bands = {kind: bands.get(kind, []) for kind in flight.fed_back}
             elif len(bands[flight.turning]) < len(DYNAMIC):
                 bands |= dict.fromkeys(('force', 'torque', 'joint'), [])
             if flight.turning:      # its answer biases gains by less than servos differ

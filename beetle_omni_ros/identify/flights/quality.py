@@ -260,6 +260,8 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
     blocks, power = len(rest), rest.mean(axis=0)
     # a slope of the spectrum is no line, so the larger of both sides counts
     places = np.arange(NEAR, len(power) - NEAR)
+    if not len(places):     # clocks allow slow motion only
+        return Unexplained('line', 1.0, 0.0, ())
     ratio = np.array([power[k] / np.maximum(power[k - NEAR:k - 1].mean(axis=0),
                                             power[k + 2:k + NEAR + 1].mean(axis=0))
                       for k in places])

@@ -4,7 +4,8 @@ Residuals of a flight that was read from a table, with their slopes.
 Two groups of channels compare the measurements with the body equations: specific force along
 the body's axes, and angular acceleration about them. Two compare the IMU with MoCap: specific
 force (acceleration) and angular velocity (rate), up to the frequency up to which their clocks
-agree. Without quaternion, the attitude follows from the direction of the measured acceleration.
+agree. Without accelerometer, the specific force is that of MoCap's positions. Without quaternion,
+the attitude follows from the direction of the measured acceleration.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from beetle_omni_ros.identify.recording.series import (
     aligned,
     along,
     derivative,
+    derivatives,
     filled,
     rising,
     slow,
@@ -36,12 +38,16 @@ COMPARED = ('acceleration', 'rate')
 GROUPS = ('force', 'torque', *COMPARED)
 CHANNELS = tuple(f'{group}_{axis}' for group in GROUPS for axis in 'xyz')
 FAR = 100.0             # [m] height without position, at which the ground has no effect
-AIRBORNE = 0.15         # [m] above the first position, one rotor diameter: no contact
+AIRBORNE = 0.15         # [m] above the floor, one rotor diameter: no contact; the floor is where
+                        # the flight begins, or at zero if it begins above
 MEMORY = 2.0            # rotor time constants after which a lost command is forgotten
 FULL = 0.995            # share of full duty from which a command is saturated
 PHASE = 0.1             # [rad] error by wrong stamps up to which a frequency counts
 HELD = 2.0              # [s] blocks of the balance of torques, so below 0.25 Hz
 SLOWEST = 0.25          # [Hz] clocks that do not agree up to here are not compared
+FASTEST = 8.0           # [Hz] of forces by MoCap, whose noise grows with the square of frequency,
+                        # and of robots that tilt, as in bags
+TILTS = 20.0            # [Hz] edge of the filter of tilts: servos are slower
 # Signal -> what the comparison of MoCap and IMU lacks without it.
 NEEDED = {'position': 'position', 'quaternion': 'quaternion', 'specific_force': 'accelerometer',
           'angular_velocity': 'gyroscope'}
@@ -63,6 +69,7 @@ class TableFlight:
         motion: velocity (world), quaternion, position, tilts, rates, thrusts of the samples.
         time: (N,) times of the samples [s].
         apart: why IMU and MoCap of this flight are not compared although both are there, or ''.
+        by_mocap: whether forces are those of MoCap's positions.
 
     """
 
@@ -81,6 +88,9 @@ class TableFlight:
         self.name, self.period = table.name, table.period
         self.time = np.arange(n) * self.period
         self.highest = _highest(table.format.clock_deviation)
+        self.by_mocap = by_mocap(table.values)
+        # groups whose noise reaches the commands: a controller flies by MoCap
+        self.fed_back = ('force', 'torque') if self.by_mocap else ('torque',)
         self._command, known = self._commands()
         self.motion, measured, reasons = self._states()
         self._seen, felt, more = self._compared()
@@ -135,6 +145,9 @@ class TableFlight:
             force = np.einsum('nji,nj->ni', rotation, acceleration + [0, 0, self.robot.gravity])
             if 'quaternion' not in v:   # the direction was used for the attitude
                 force = np.stack([np.full(n, np.nan), np.full(n, np.nan), force[:, 2]], axis=1)
+        elif self.by_mocap:
+            self.highest = min(self.highest, _highest(self._wander), FASTEST)
+            force = self._force_by_mocap(position, rotation)
         else:
             force = np.full((n, 3), np.nan)
         for k in range(3):
@@ -146,14 +159,25 @@ class TableFlight:
         else:
             rate, turned = np.zeros((n, 3)), np.full((n, 3), np.nan)
             reasons[3:] = ['no gyroscope'] * 3
-        tilt = filled(v['tilt'], h)[0] if 'tilt' in v else np.zeros((n, 4))
-        inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': rate, 'tilt': tilt,
-                  'thrust': self._thrust({})[0], 'tilt_rate': np.gradient(tilt, h, axis=0),
-                  'tilt_acceleration': np.zeros((n, 4)), 'thrust_rate': np.zeros((n, 4)),
-                  'position': position, 'voltage': np.ones(n),
-                  'modules': np.zeros(n),
+        tilt = derivatives(filled(v['tilt'], h)[0], TILTS, h) if 'tilt' in v \
+            else np.zeros((3, n, 4))
+        if 'tilt' in v:
+            self.highest = min(self.highest, FASTEST)
+        inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': rate, 'tilt': tilt[0],
+                  'thrust': self._thrust({})[0], 'tilt_rate': tilt[1],
+                  'tilt_acceleration': tilt[2], 'thrust_rate': np.zeros((n, 4)),
+                  'position': position, 'voltage': np.ones(n), 'modules': np.ones(n),
                   **{f'state of {name}': np.zeros((n, 4)) for name in self.body.slow}}
         return inputs, np.concatenate([force, turned], axis=1), reasons
+
+    def _force_by_mocap(self, position, rotation):
+        """(N, 3) specific force of positions and attitudes; NaN: they are not measured."""
+        h = self.period
+        up = derivative(derivative(slow(position, h, self.highest), h), h)
+        force = np.einsum('nji,nj->ni', rotation, up + [0, 0, self.robot.gravity])
+        for name in ('position', 'quaternion'):
+            force[~filled(self.table.values[name], h)[1]] = np.nan
+        return force
 
     def _compared(self):
         """(N, 6) specific force and rate by MoCap, the same by the IMU, and why one lacks."""
@@ -182,10 +206,11 @@ class TableFlight:
 
     def _flying(self):
         """(N,) whether the robot is in the air."""
-        position = self.motion['position']
-        high = 'position' not in self.table.values or (
-            position[:, 2] > position[:10, 2].mean() + AIRBORNE)
+        height = self.motion['position'][:, 2]
         lifted = self._thrust({})[0].sum(axis=1) > 0.5 * self.robot.mass * self.robot.gravity
+        first = height[:10].mean()
+        high = height > (0.0 if lifted[:10].all() and first > AIRBORNE else first) + AIRBORNE
+        high |= 'position' not in self.table.values
         edge = int(round(0.5 / self.period))    # half a second of transients at both ends
         return np.convolve(~(high & lifted), np.ones(2 * edge + 1), 'same') == 0
 
@@ -241,8 +266,10 @@ class TableFlight:
         matrix = Rotation.from_rotvec(imu).as_matrix()
         # what MoCap states of its axes is turned back into the body
         seen = Rotation.from_rotvec(mocap).as_matrix().T @ matrix
+        felt = out[:, :3] @ Rotation.from_rotvec(mocap).as_matrix() if self.by_mocap \
+            else out[:, :3] @ matrix + force
         return np.concatenate([
-            out[:, :3] @ matrix + force, out[:, 3:] @ matrix, self._seen[:, :3] @ seen + force,
+            felt, out[:, 3:] @ matrix, self._seen[:, :3] @ seen + force,
             self._seen[:, 3:] @ seen + rate], axis=1)
 
     def linear(self, theta: dict[str, float], names: list[str]) -> Linear:
@@ -295,6 +322,12 @@ class TableFlight:
         return self._sensed(self.body(inputs, body_theta), theta)
 
 
+def by_mocap(signals) -> bool:
+    """Whether forces are those of MoCap: positions and attitudes, but no acceleration."""
+    return {'position', 'quaternion'} <= set(signals) \
+        and not {'specific_force', 'acceleration'} & set(signals)
+
+
 def _highest(deviation):
     """Frequency [Hz] up to which stamps with this deviation [s] turn the phase too little."""
     return PHASE / (2 * np.pi * deviation) if deviation else np.inf
@@ -322,8 +355,8 @@ def poses(table, far):
         return position, None, np.inf
     quaternion, seen = filled(aligned(v['quaternion']), h)
     deviation = table.format.clock_deviation
-    imu = next((signals[name].clock for name in ('angular_velocity', 'specific_force')
-                if name in v), None)
+    imu = next((signals[name].clock for name in (
+        'angular_velocity', 'specific_force', 'duty', 'thrust') if name in v), None)
     if imu not in (None, signals['quaternion'].clock):
         late, deviation = np.nan, np.inf
         if 'angular_velocity' in v:

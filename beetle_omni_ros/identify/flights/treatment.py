@@ -97,6 +97,9 @@ TREATMENTS: dict[str, Treatment] = {
         {'force': Size(1.0, 0.1)}, 'any flight; yaw turns',
         ('mass', 'imu_misalignment', 'mocap_misalignment'),
         'hover at yaw 0 and 180 deg; fan off'),
+    'wind_velocity': Treatment(
+        {'velocity': Size(2.0, 0.2)}, 'any flight; yaw turns', ('wind', 'mocap_misalignment'),
+        'hover at yaw 0 and 180 deg; fan off'),
     'propeller_gyroscopic_torque': Treatment(
         # its part about the tilt axes loads the servos, which the model leaves out
         {'angular_momentum_at_hover': Size(0.066, 0.008, step=5e-3)},

@@ -28,11 +28,17 @@ from beetle_omni_ros.identify.flights.keys import (
     TILT_BUS,
     tolerances,
     VARYING,
+    VERTICAL,
 )
 from beetle_omni_ros.identify.flights.results import ALPHA, concluded, result_of, Starts
 from beetle_omni_ros.identify.flights.servo import starts_of
 from beetle_omni_ros.identify.flights.signals import IMU_LAG
-from beetle_omni_ros.identify.flights.table_flight import COMPARED, GROUPS, TableFlight
+from beetle_omni_ros.identify.flights.table_flight import (
+    by_mocap,
+    COMPARED,
+    GROUPS,
+    TableFlight,
+)
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.recording.bag import Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
@@ -47,9 +53,9 @@ BAG_GROUPS = {group: {'used': True, 'channels': [c for c in BagFlight.channels
               for group in ('force', 'torque', 'acceleration', 'rate', 'joint')}
 # Entries of each group of channels. Those of the torques also need the forces.
 FORCES = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_drag',
-          'axial_inflow', 'translational_lift', 'wind', 'voltage_sag', 'rotor_lag',
-          'rotor_dead_time', 'command_latency', 'imu_accelerometer_bias', 'imu_misalignment',
-          'formula')
+          'axial_inflow', 'translational_lift', 'wind', 'wind_velocity', 'voltage_sag',
+          'rotor_lag', 'rotor_dead_time', 'command_latency', 'imu_accelerometer_bias',
+          'imu_misalignment', 'formula')
 TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coefficient',
            'rotor_hub_moment', 'propeller_gyroscopic_torque', 'rotor_acceleration_torque')
 FEEDBACK = ('the commands explain too little of the angular acceleration: a controller that feeds '
@@ -109,7 +115,7 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     return result | then(engine, solution, result, starts, others or models) if then else result
 
 
-def _priors(robot, keys, tolerance, stamps=0.0, weighed=WEIGHED):
+def _priors(robot, keys, tolerance, stamps=0.0):
     """
     Spreads, entries, bounds of keys of the catalogue, and those that may be far from the file.
 
@@ -117,7 +123,7 @@ def _priors(robot, keys, tolerance, stamps=0.0, weighed=WEIGHED):
     """
     priors = {n: prior_of(robot, key, tolerance.get(n, 0.0), stamps) for n, key in keys.items()}
     bounds = {n: (0.0, np.inf) for n, key in keys.items() if key.ends_at_none}
-    far = frozenset(n for n, key in keys.items() if key.effect not in weighed
+    far = frozenset(n for n, key in keys.items() if key.effect not in WEIGHED
                     and CATALOGUE[key.effect].layer not in ('sensor', 'timing'))
     return priors, entries_of(keys), bounds, far
 
@@ -180,6 +186,8 @@ def _engine(flights, robot, p, declared, alpha):
         names |= set(TORQUES)
     if any(name.startswith(COMPARED) for name in channels):
         names |= set(SENSORS)
+    if by_mocap(signals):
+        names = names - {'imu_accelerometer_bias', 'imu_misalignment'} | {'mocap_misalignment'}
     if 'position' not in signals:
         names -= {'ground_effect'}
     if not {'position', 'velocity'} & signals:
@@ -188,16 +196,20 @@ def _engine(flights, robot, p, declared, alpha):
     if 'voltage' not in signals:
         names -= {'voltage_sag'}
     if 'force_x' not in channels:
-        names -= {'imu_misalignment', 'wind', 'rotor_drag', 'body_drag'}
+        names -= {'imu_misalignment', 'wind', 'wind_velocity', 'rotor_drag', 'body_drag'}
     keys = keys_of(robot, names - set(p.without))
-    # Air is still in a hall.
-    priors, entries, bounds, far = _priors(robot, keys, tolerances(p), declared.clock_deviation,
-                                            (*WEIGHED, 'wind'))
-    if 'specific_force' not in signals:     # the lag is that of an estimator
+    priors, entries, bounds, far = _priors(robot, keys, tolerances(p), declared.clock_deviation)
+    far -= set(VERTICAL)
+    if estimated(declared):     # the lag is that of an estimator
         priors |= {name: replace(priors[name], narrow=priors[name].typical)
                     for name, key in keys.items() if key.effect in LAGS}
         entries = [entry for entry in entries if entry.name not in LAGS]
     return Engine(flights, priors, entries, bounds, far, alpha), keys
+
+
+def estimated(declared: Format) -> bool:
+    """Whether an estimator makes the forces."""
+    return 'specific_force' not in declared.signals and 'acceleration' in declared.signals
 
 
 def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
@@ -212,7 +224,7 @@ def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
     if not {'duty', 'thrust'} & set(declared.signals):
         raise ParameterError(f"--format {declared.name}: expected the key 'duty' or 'thrust'")
     keys = keys_of(robot, {*FORCES, *TORQUES, *SENSORS})
-    body = BodyModel(robot, {**all_keys(robot), **extra_keys()}, (0.0, 0.0))
+    body = BodyModel(robot, {**all_keys(robot), **extra_keys()}, tilting_modules(robot))
     return [TableFlight(read_flight(path, declared), robot, body, keys) for path in paths]
 
 
@@ -258,7 +270,7 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
                             'reason': 'no gyroscope: means of 2 s, by the attitude'}
     result = concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
                        findings=findings, slow=Balance(slow, robot) if slow else None,
-                       measured='specific_force' in declared.signals)
+                       measured=not estimated(declared))
     return result | then(engine, solution, result, None, judges) if then else result
 
 
