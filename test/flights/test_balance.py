@@ -33,8 +33,7 @@ def write_flight(path, seed, scale=(1, 1, 1, 1), hub=5e-4, load=(0.0, 0.0), move
     need = np.column_stack([np.full(len(t), WEIGHT), np.full(len(t), load[1] * WEIGHT),
                             -load[0] * WEIGHT + hub * speed, np.zeros(len(t))])
     need[:, 1:3] += moved * WEIGHT * ARM * rng.normal(size=(len(t), 2))
-    arms = np.array([[1, 1, 1, 1], [-ARM, -ARM, ARM, ARM], [-ARM, ARM, ARM, -ARM],
-                     [1, -1, 1, -1]])
+    arms = np.array([[1, 1, 1, 1], [-ARM, -ARM, ARM, ARM], [-ARM, ARM, ARM, -ARM], [1, -1, 1, -1]])
     thrust = np.linalg.solve(arms, need.T).T / scale
     place = np.cumsum(speed) * 0.00992
     up = rng.normal(size=(len(t), 3)) * 0.05
@@ -92,8 +91,7 @@ def test_evidence_and_estimate_agree_with_dense_densities():
     load = [sum(np.outer(x, x) for x in offset), *(np.outer(x, x) for x in corners)]
     for label, shapes in (('rotor_thrust_coefficient[3]', [third]), ('centre_of_mass', load)):
         k = [entry.label for entry in found.entries].index(label)
-        assert found.gains[k,] == pytest.approx(
-            density(*shapes) - density() - log(9), abs=1e-5)
+        assert found.gains[k] == pytest.approx(density(*shapes) - density() - log(9), abs=1e-5)
     null = a @ np.diag(narrow**2 + (SESSION * rotors)**2) @ a.T \
         + (a * flight**2 @ a.T) * same + found.noise * np.eye(20)
     wide = null + a @ third @ a.T
