@@ -91,7 +91,8 @@ def test_evidence_and_estimate_agree_with_dense_densities():
     load = [sum(np.outer(x, x) for x in offset), *(np.outer(x, x) for x in corners)]
     for label, shapes in (('rotor_thrust_coefficient[3]', [third]), ('centre_of_mass', load)):
         k = [entry.label for entry in found.entries].index(label)
-        assert found.gains[k] == pytest.approx(density(*shapes) - density() - log(9), abs=1e-5)
+        assert found.gains[k,] == pytest.approx(
+            density(*shapes) - density() - log(9), abs=1e-5)
     null = a @ np.diag(narrow**2 + (SESSION * rotors)**2) @ a.T \
         + (a * flight**2 @ a.T) * same + found.noise * np.eye(20)
     wide = null + a @ third @ a.T
