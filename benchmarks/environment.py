@@ -1,16 +1,11 @@
 """
-Speed of environment, rollout and update in training, compared with the loop of rsl-rl.
+Speed of training compared with the loop of rsl-rl: ``python benchmarks/environment.py``.
 
-    python benchmarks/environment.py [--device cuda]
-
-On a GPU the environment's steps, the rollout and the update run as captured graphs. Rollout and
+The environment's steps, the rollout and the update run as captured graphs on a GPU. Rollout and
 update of rsl-rl are its own functions on the same robots, networks and samples; its rollout steps
-the environment without captured graphs. On a CPU the sizes are small, without a target speed.
+the environment without captured graphs.
 """
 
-from __future__ import annotations
-
-import argparse
 from collections.abc import Callable
 from dataclasses import replace
 import statistics
@@ -23,26 +18,22 @@ from rsl_rl.algorithms import PPO
 import torch
 
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 from beetle_omni_ros.train.parameters import TrainParameters
-from beetle_omni_ros.train.runner import choose_device, Runner
+from beetle_omni_ros.train.runner import Runner
 
-TARGET = 10e6                  # environment steps a second, on a GPU
-GPU_ROBOTS, CPU_ROBOTS = (4096, 16384), (64, 1024)
-CPU_PPO_ROBOTS = 64            # of rollout and update on a CPU
-GRAPH_STEPS = 100              # of the environment in one captured graph
-ROBOT = RobotParameters.load()
+TARGET, ROBOTS = 10e6, (4096, 16384)    # environment steps a second
+GRAPH_STEPS = 100       # of the environment in one captured graph
+ROBOT, DEVICE = RobotParameters.load(), 'cuda'
 
 
-def seconds(function: Callable, device: str, repeats: int) -> float:
+def seconds(function: Callable, repeats: int) -> float:
     """Median time of a call, after one call to warm up."""
     times = []
     for _ in range(repeats + 1):
         begin = time.perf_counter()
         function()
-        if device.startswith('cuda'):
-            torch.cuda.synchronize()
+        torch.cuda.synchronize()
         times.append(time.perf_counter() - begin)
     return statistics.median(times[1:])
 
@@ -53,12 +44,10 @@ def with_robots(robots: int) -> TrainParameters:
     return replace(parameters, ppo=replace(parameters.ppo, robots=robots))
 
 
-def environment_rate(robots: int, device: str) -> float:
+def environment_rate(robots: int) -> float:
     """Steps a second, summed over robots."""
-    env = TiltableQuadrotorEnv(with_robots(robots), ROBOT, device)
-    action = torch.zeros(robots, 8, device=device)
-    if not device.startswith('cuda'):
-        return robots / seconds(lambda: env.advance(action), device, 20)
+    env = TiltableQuadrotorEnv(with_robots(robots), ROBOT, DEVICE)
+    action = torch.zeros(robots, 8, device=DEVICE)
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
@@ -69,26 +58,26 @@ def environment_rate(robots: int, device: str) -> float:
     with torch.cuda.graph(graph):
         for _ in range(GRAPH_STEPS):
             env.advance(action)
-    return robots * GRAPH_STEPS / seconds(graph.replay, device, 5)
+    return robots * GRAPH_STEPS / seconds(graph.replay, 5)
 
 
-def made_runner(robots: int, device: str, graphs: bool) -> Runner:
+def made_runner(robots: int, graphs: bool) -> Runner:
     """Make a training without output files."""
-    runner = Runner(with_robots(robots), ROBOT, None, device, graphs=graphs)
+    runner = Runner(with_robots(robots), ROBOT, None, DEVICE, graphs=graphs)
     runner.apply_schedule(0.0)
     return runner
 
 
-def ours(robots: int, device: str) -> dict[str, float]:
+def ours(robots: int) -> dict[str, float]:
     """Seconds of one iteration's rollout and update."""
-    runner = made_runner(robots, device, device.startswith('cuda'))
-    return {'rollout': seconds(runner.alg.collect, device, 5),
-            'update': seconds(runner.alg.learn_batch, device, 5)}
+    runner = made_runner(robots, True)
+    return {'rollout': seconds(runner.alg.collect, 5),
+            'update': seconds(runner.alg.learn_batch, 5)}
 
 
-def rsl_rls(robots: int, device: str) -> dict[str, float]:
+def rsl_rls(robots: int) -> dict[str, float]:
     """Measure rsl-rl's own functions likewise."""
-    runner = made_runner(robots, device, False)
+    runner = made_runner(robots, False)
     alg, env = runner.alg, runner.env
 
     def rollout():
@@ -102,41 +91,31 @@ def rsl_rls(robots: int, device: str) -> dict[str, float]:
                                      {'time_outs': env.timeout.float()})
             alg.compute_returns(seen)
 
-    return {'rollout': seconds(rollout, device, 2),
-            'update': seconds(lambda: PPO.update(alg), device, 3)}
+    return {'rollout': seconds(rollout, 2),
+            'update': seconds(lambda: PPO.update(alg), 3)}
 
 
 def main():
-    """Measure and print; status 1 if the environment misses its target on a GPU."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--device', default='auto')
-    try:
-        device = choose_device(parser.parse_args().device)
-    except ParameterError as error:
-        parser.error(str(error))
-    gpu = device.startswith('cuda')
+    """Measure and print; status 1 if the environment misses its target."""
+    if not torch.cuda.is_available():
+        sys.exit('environment.py: expected a GPU')
     torch.set_float32_matmul_precision('high')
-    if not gpu:
-        torch.set_num_threads(1)    # several threads wait for each other on a shared computer
-    print(f"{torch.cuda.get_device_name(device) if gpu else 'CPU, one thread'}, "
-          f'torch {torch.__version__}')
-    missed = False
-    for size in GPU_ROBOTS if gpu else CPU_ROBOTS:
-        rate = environment_rate(size, device)
-        missed = missed or gpu and rate < TARGET
-        print(f'environment, {size} robots: {rate / 1e6:.3g} million steps/s'
-              + f', required {TARGET / 1e6:g}' * gpu)
+    print(f'{torch.cuda.get_device_name(DEVICE)}, torch {torch.__version__}')
+    rates = {size: environment_rate(size) for size in ROBOTS}
+    for size, rate in rates.items():
+        print(f'environment, {size} robots: {rate / 1e6:.3g} million steps/s, required '
+              f'{TARGET / 1e6:g}')
     ppo = TrainParameters.load().ppo
-    robots = ppo.robots if gpu else CPU_PPO_ROBOTS
+    robots = ppo.robots
     table = Table('', *(Column(name, justify='right') for name in (
         'rollout', 'update', 'both', 'samples/s')),
         title=f'one iteration, {robots} robots x {ppo.steps} steps [ms]')
     for name, measured in (('ours', ours), ('rsl-rl', rsl_rls)):
-        rollout, update = measured(robots, device).values()
+        rollout, update = measured(robots).values()
         table.add_row(name, *(f'{1e3 * value:.1f}' for value in (
             rollout, update, rollout + update)), f'{robots * ppo.steps / (rollout + update):.2e}')
     Console(width=100).print(table)
-    sys.exit(missed)
+    sys.exit(min(rates.values()) < TARGET)
 
 
 if __name__ == '__main__':

@@ -6,8 +6,6 @@ families outside it; undisturbed plants have no law. True states of the third fl
 ``--baseline`` adds plain sparse regression (pysindy). The same command continues a run.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections import namedtuple
 from contextlib import closing
@@ -30,7 +28,8 @@ from beetle_omni_ros.identify.flights.keys import all_keys, ARM, extra_keys, LIM
 from beetle_omni_ros.identify.recording import bag, flight, parameters
 from beetle_omni_ros.model import dynamics, effects, formula, terms
 from beetle_omni_ros.model.files import write_json
-from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.parameters import mass_properties, RobotParameters
+from beetle_omni_ros.model.schema import ParameterError
 
 LIKE, CLOSED = 0.95, 0.8    # least correlation and closure of a law that is rediscovered
 LOW = 0.3                   # [m] the flight above counts
@@ -111,7 +110,7 @@ def drawn(name, robot, rng):
         way *= np.arange(len(keys)) == rng.integers(len(keys))
     way = way / np.linalg.norm(way) if keys[-1].index else np.sign(way[:1]).repeat(len(keys))
     if entry.delays or name in LIMITS:
-        way = -np.ones(1) if name in LIMITS else np.ones(1)
+        way = np.full(len(keys), -1 if name in LIMITS else 1)
     for key, part in zip(keys, way, strict=True):
         spec, more = entry.parameters[key.parameter], factor * part * key.typical
         made.setdefault(key.parameter, []).append(float(key.value(
@@ -119,7 +118,35 @@ def drawn(name, robot, rng):
     return {key: tuple(each) if len(each) > 1 else each[0] for key, each in made.items()}
 
 
-def fly(controller, robot, plant, seed, path):
+def described(names, folder):
+    """Robot that the flights are compared with, and its file; without modules that are hidden."""
+    path = folder / 'own.yaml'
+    path.write_text('extends: robot.yaml\n' + 'multibody: null\n' * ('module_reaction' in names))
+    return RobotParameters.load(path), path
+
+
+def hidden(names, robot, controller, tasks, rng, folder):
+    """
+    Draw effects until the robot is possible and no flight is lost.
+
+    Returns:
+        The plant, the bags, the last result of :func:`fly`, the number of lost draws.
+
+    """
+    for lost in range(TRIES):
+        plant = replace(robot, effects={name: drawn(name, robot, rng) for name in names})
+        paths = [folder / f'{lost}_{k}' for k in range(len(tasks))]
+        try:
+            mass_properties(plant)
+        except ParameterError:      # an inertia that no body has
+            continue
+        if all(flown := fly(controller, robot, plant, task, int(rng.integers(2**31)), path)
+               for task, path in zip(tasks, paths, strict=True)):
+            return plant, paths, flown, lost
+    raise RuntimeError(f'{TRIES} flights are lost')
+
+
+def fly(controller, robot, plant, task, seed, path):
     """True states at 200 Hz above LOW, and those with the thrusts of another robot; None: lost."""
     loop, rows = prepared(controller, robot=robot, plant=plant, seed=seed, bag=path), []
     simulator = loop.simulator
@@ -129,7 +156,7 @@ def fly(controller, robot, plant, seed, path):
                      simulator.battery.voltage])
     loop.before_messages = note
     with closing(loop):
-        if not loop.fly(make_task('random5', seed)):
+        if not loop.fly(make_task(task, seed)):
             return None
         sent = loop.recording().command
     *states, tilt_rate, real, t, voltage = map(np.array, zip(*rows, strict=True))
@@ -166,15 +193,12 @@ def wrench(robot, base, states):
     return np.array(made.map(len(states['thrust']))(*(values.T for values in states.values()))).T
 
 
-def correlation(true, found):
-    """Of two wrenches (N, 6), less the mean of each component."""
+def agreement(true, found):
+    """Correlation of wrenches (N, 6) less their means, and found share of the true power."""
     a, b = (each - each.mean(axis=0) for each in (true, found))
-    return float((a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-9))
-
-
-def share(true, found):
-    """Of the power of a true wrench (N, 6) that a found one explains."""
-    return float(1 - ((true - found)**2).sum() / max((true**2).sum(), 1e-9))
+    return {'correlation': float((a * b).sum() / max(
+                np.sqrt((a**2).sum() * (b**2).sum()), 1e-9)),
+            'share': float(1 - ((true - found)**2).sum() / max((true**2).sum(), 1e-9))}
 
 
 def with_formula(robot, found):
@@ -208,32 +232,29 @@ def examined(case):
     """What `gap --learn` finds of the flights of a case, and how true it is."""
     # Of the module, because a worker has a copy of globals. Without a treatment no fit has them.
     effects.CATALOGUE.update({name: family(name) for name in KINDS['outside']})
-    began, controller = process_time(), ('nmpc', 'rl')[case.number % 2]
+    controller = ('nmpc', 'rl')[case.number % 2]
+    return {'case': case.name, 'kind': case.kind, 'controller': controller,
+            **attempted(compared, case, controller)}
+
+
+def attempted(function, *given):
+    """Row of a case by a function of it and an empty folder, or its failure; and CPU time."""
+    began = process_time()
     try:
         with tempfile.TemporaryDirectory() as folder:
-            row = compared(case, controller, Path(folder))
+            row = function(*given, Path(folder))
     except Exception as error:      # of one case; the others continue
         row = {'failure': f'{type(error).__name__}: {error}'}
-    return {'case': case.name, 'kind': case.kind, 'controller': controller, **row,
-            'cpu_s': round(process_time() - began, 1)}
+    return row | {'cpu_s': round(process_time() - began, 1)}
 
 
 def compared(case, controller, folder):
     """Answers about three flights of a plant, and their correlations with the true force."""
     rng = np.random.default_rng([case.seed, list(KINDS).index(case.kind), case.number])
-    base = RobotParameters.load()
-    if case.effect == 'module_reaction':    # else the plant has modules
-        base = replace(base, multibody=None)
-    for lost in range(TRIES):
-        truth = {} if case.kind == UNDISTURBED else {case.effect: drawn(case.effect, base, rng)}
-        plant, paths = replace(base, effects=truth), [folder / f'{lost}_{i}' for i in range(3)]
-        if all(flown := fly(controller, base, plant, int(rng.integers(2**31)), path)
-               for path in paths):
-            break
-    else:
-        raise RuntimeError(f'{TRIES} flights are lost')
-    robot, without, corrected = (folder / f'{each}.yaml' for each in ('own', 'less', 'corrected'))
-    robot.write_text('extends: robot.yaml\n' + 'multibody: null\n' * (base.multibody is None))
+    names = [] if case.kind == UNDISTURBED else [case.effect]
+    base, robot = described(names, folder)
+    plant, paths, flown, lost = hidden(names, base, controller, ['random5'] * 3, rng, folder)
+    without, corrected = folder / 'less.yaml', folder / 'corrected.yaml'
     without.write_text(f"without: [{case.effect * (case.kind == 'left_out')}]\n")
     result = command.gap_results(paths[:2], paths[2:], robot, corrected, parameters=without,
                                  learn=folder / 'effect.yaml', console=Console(quiet=True))
@@ -246,14 +267,15 @@ def compared(case, controller, folder):
     before = wrench(base, base, flown(base))
     true = wrench(plant, base, flown()) - before
     of_formula = result['formula']
-    return {'truth': truth, 'lost': lost, 'force_N': float(np.sqrt((true**2).sum(1).mean())),
-            'named': named, 'verdict': result['verdict'], 'closure': result['closure'],
+    force = float(np.sqrt((true**2).sum(1).mean()))
+    return {'truth': plant.effects, 'lost': lost, 'force_N': force, 'named': named,
+            'verdict': result['verdict'], 'closure': result['closure'],
             'closure_of_formula': of_formula.get('closure'), 'reason': of_formula.get('reason'),
             'ln_bayes_factor': of_formula.get('ln_bayes_factor'),
             **{f'formula{which}': law for which, law in laws.items()},
-            **{f'{kind}{which}': of(true, wrench(other, base, flown(other)) - before)
-               for which, other in answers.items()
-               for kind, of in (('correlation', correlation), ('share', share))}}
+            **{f'{kind}{which}': number for which, other in answers.items()
+               for kind, number in agreement(
+                   true, wrench(other, base, flown(other)) - before).items()}}
 
 
 def line(case, row, kept=False):
@@ -278,11 +300,17 @@ def summary(rows):
     return {'cases': len(rows), 'failures': len(rows) - len(own), 'formulas': len(laws),
             'rediscovered': sum(bool(row['correlation'] >= LIKE and row['closure'] >= CLOSED)
                                 for row in laws),
-            'of_true_force': sum(bool(row['correlation'] >= LIKE and row['share_all'] >= CLOSED)
-                                 for row in laws),
-            'named_without_formula': sum(bool(row['named']) for row in own if row not in laws),
             'baseline_formulas': sum(bool(row['formula_baseline']) for row in own),
             'baseline_correlated': sum(row['correlation_baseline'] >= LIKE for row in own)}
+
+
+def swept(function, cases, given, console, line):
+    """Rows of cases by a function; those that this code has finished are kept and not repeated."""
+    code = digest(*(path.read_bytes() for folder in (SOURCE, Path(__file__).parent)
+                    for path in sorted(folder.rglob('*.py'))))
+    return sweep(function, [(case._replace(key=digest(code, repr(case))),) for case in cases],
+                 store=Store(given.out.with_suffix('')), jobs=given.jobs, console=console,
+                 line=line)
 
 
 def main():
@@ -298,18 +326,14 @@ def main():
     given = parser.parse_args()
     if given.baseline and importlib.util.find_spec('pysindy') is None:
         parser.error('--baseline: expected the package pysindy, which is no dependency')
-    code = digest(*(path.read_bytes() for path in (
-        Path(__file__), *sorted(SOURCE.rglob('*.py')))))
-    cases = [Case(f'{kind} {names[k % len(names)]} {k}', code, 1, kind, names[k % len(names)], k,
+    cases = [Case(f'{kind} {names[k % len(names)]} {k}', '', 1, kind, names[k % len(names)], k,
                   given.seed, given.baseline)
              for kind, names in KINDS.items() if given.only in (None, kind)
              for k in range(given.cases or (50 if kind == UNDISTURBED else len(names)))]
-    calls = [(case._replace(key=digest(repr(case))),) for case in cases]
     console = Console(width=250)
     console.print(f'{"case":42} by    force [N], correlation of the formula, share of its power '
                   'with the entries named beside it, closure, ln B, these entries | formula')
-    rows = sweep(examined, calls, store=Store(given.out.with_suffix('')), jobs=given.jobs,
-                 console=console, line=line)
+    rows = swept(examined, cases, given, console, line)
     counts = {kind: summary(own) for kind in KINDS if (
         own := [row for row in rows if row['kind'] == kind])}
     write_json(given.out, {'seed': given.seed, 'summary': counts, 'cases': rows})

@@ -7,17 +7,16 @@ answers are compared with the labels. Flights and answers are kept; the same com
 interrupted campaign.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
 from pathlib import Path
+import shlex
 import sys
 
 from rich.console import Console
 from rich.markdown import Markdown
-from rich.progress import Progress
+from rich.progress import track
 
 HERE = Path(__file__).resolve().parent
 PLACES = [str(HERE), str(HERE.parent)]
@@ -30,11 +29,12 @@ from gap_data.score import markdown, score  # noqa: E402
 
 from beetle_omni_ros.flight.campaign import digest, SOURCE, workers  # noqa: E402
 
-CONDITIONS = 'nominal', 'published'
+# words of --only; of each sort named, one must fit
+SORTS = KINDS, DIFFICULTIES, ('nominal', 'published'), (*CATALOGUE, *OUTSIDE)
 TOOL = f'{sys.executable} -m beetle_omni_ros'
 
 
-def parse(arguments: list[str] | None) -> argparse.Namespace:
+def parse() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
     parser.add_argument('--set', default='fast', choices=tuple(load_settings()['sets']))
@@ -43,13 +43,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--only', default='', help='only these kinds, difficulties, conditions '
                         'and effects, separated by commas; of each sort named, one must fit')
     parser.add_argument('--tool', default=TOOL, help='command before `gap` (this tree)')
-    parser.add_argument('--flights-only', action='store_true', help='make the flights, ask nobody')
     parser.add_argument('--folder', type=Path, default=Path('runs_out/gap_campaign'))
     parser.add_argument('--jobs', type=int, help='at a time (every core)')
-    given = parser.parse_args(arguments)
-    unknown = {*filter(None, given.only.split(','))} - {
-        *KINDS, *DIFFICULTIES, *CONDITIONS, *CATALOGUE, *OUTSIDE}
-    if unknown:
+    given = parser.parse_args()
+    if unknown := {*filter(None, given.only.split(','))}.difference(*SORTS):
         parser.error(f"--only '{given.only}': no kind, difficulty, condition or effect is called "
                      f"{', '.join(sorted(unknown))}")
     return given
@@ -57,38 +54,28 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def chosen(given: argparse.Namespace) -> list:
     """Cases of the command line."""
-    names = {*filter(None, given.only.split(','))}
-    kinds, difficulties, conditions = (
-        names & set(each) for each in (KINDS, DIFFICULTIES, CONDITIONS))
-    effects = names - kinds - difficulties - conditions
-    cases = [c for c in make_cases(given.set, given.seed)
-             if c.kind in (kinds or KINDS) and c.difficulty in (difficulties or DIFFICULTIES)
-             and c.conditions in (conditions or CONDITIONS)
-             and (not effects or effects & {e[0] for e in c.effects})]
+    named = [words for sort in SORTS if (words := {*given.only.split(',')} & {*sort})]
+    cases = [c for c in make_cases(given.set, given.seed) if all(
+        words & {c.kind, c.difficulty, c.conditions, *(name for name, _, _ in c.effects)}
+        for words in named)]
     if given.cases is not None and given.cases < len(cases):
         step = (len(cases) - 1) / max(1, given.cases - 1)
         cases = [cases[round(k * step)] for k in range(given.cases)]
     return cases
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main() -> int:
     """Run a campaign and write report.json and report.md."""
-    given = parse(arguments)
+    given = parse()
     os.environ['PYTHONPATH'] = os.pathsep.join(filter(None, [
         *PLACES, os.environ.get('PYTHONPATH', '')]))     # for the workers and the tool
     cases, folder = chosen(given), given.folder.resolve()
     version = digest(*(path.read_bytes() for path in sorted(SOURCE.rglob('*.py'))))[:8]
-    with Progress(console=Console(stderr=True)) as bars, workers(jobs=given.jobs):
-        bar = bars.add_task('cases', total=len(cases))
-        judged = run_campaign(cases, '' if given.flights_only else given.tool, folder,
-                              version=version, done=lambda: bars.advance(bar))
-    if given.flights_only:
-        print(f'{len(cases)} cases in {folder}')
-        return 0
-    words = [f'--{name} {value}' for name in ('set', 'seed', 'cases', 'only')
-             if (value := getattr(given, name)) not in (None, '')]
+    with workers(jobs=given.jobs):
+        judged = [row for row in track(run_campaign(cases, given.tool, folder, version=version),
+                                       'cases', len(cases), console=Console(stderr=True)) if row]
     report = {'meta': {'cases': len(cases), 'lost': len(cases) - len(judged), 'code': version,
-                       'command': ' '.join(['python benchmarks/gap_campaign.py', *words])},
+                       'command': shlex.join(['python', *sys.argv])},
               'criteria': score(judged), 'judged': judged}
     (folder / 'report.json').write_text(json.dumps(report, indent=1))
     (folder / 'report.md').write_text(markdown(report))

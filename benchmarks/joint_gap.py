@@ -8,8 +8,6 @@ unchanged, circularly shifted, or in blocks of a second drawn at random. The log
 the servos before the change.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +21,7 @@ from rich.table import Table
 from beetle_omni_ros.identify.servo import compare as servo_compare
 from beetle_omni_ros.identify.servo.compare import compare, gap_of
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
-from beetle_omni_ros.identify.servo.model import INDEX, simulate
+from beetle_omni_ros.identify.servo.model import INDEX, NAMES, simulate
 from beetle_omni_ros.identify.servo.results import identify
 from beetle_omni_ros.model.parameters import RobotParameters
 
@@ -40,7 +38,7 @@ KINDS = {'nothing': None, 'zero': 'joint_offset', 'two zeros': 'joint_offset',
 
 
 def changed(sets: np.ndarray, log: JointLog, kind: str, rng: np.random.Generator):
-    """Changed sets (J, P), (name, joint or None) of what must be named, and a description."""
+    """Changed sets (J, P), and (name, joint or None) of what must be named."""
     sets, count = sets.copy(), len(sets)
     name, joints = KINDS[kind], rng.permutation(count)
 
@@ -48,38 +46,32 @@ def changed(sets: np.ndarray, log: JointLog, kind: str, rng: np.random.Generator
         return float(rng.uniform(low, high) * rng.choice([-1, 1]))
 
     if kind == 'nothing':
-        return sets, set(), ''
+        return sets, set()
     if kind in ('zero', 'two zeros', 'encoder gain'):
-        words = []
         joints = joints[:2 if kind == 'two zeros' else 1]
         for j in joints:
             by = sized(*SIZE)
             if kind == 'encoder gain':
                 by /= np.abs(log.measured[j]).max()
             sets[j, INDEX['encoder_gain' if kind == 'encoder gain' else 'offset']] += by
-            words.append(f'joint {log.joints[j]} {by:+.4f}')
-        return sets, {(name, log.joints[j]) for j in joints}, ', '.join(words)
+        return sets, {(name, log.joints[j]) for j in joints}
     which = slice(None) if kind == 'delay' or rng.random() < 0.5 else joints[:1]
     if kind == 'servo gains':
         kp, kd = ((1 + sized(0.2, 0.4)) if used else 1.0
                   for used in ((True, False), (False, True), (True, True))[rng.integers(3)])
         sets[which, INDEX['natural_frequency']] *= np.sqrt(kp)
         sets[which, INDEX['damping_ratio']] *= kd / np.sqrt(kp)
-        words = f'kp x {kp:.2f}, kd x {kd:.2f}'
     elif kind == 'delay':
         by = sized(0.008, 0.020)
         by = by if sets[:, INDEX['delay']].min() + by >= 0 else -by
         sets[which, INDEX['delay']] += by
-        words = f'{1e3 * by:+.1f} ms'
     else:
         term = 'coulomb_friction' if kind == 'friction' else 'backlash'
         by = float(rng.uniform(*SIZE))
         if rng.random() < 0.5 and sets[which, INDEX[term]].min() > by:
             by = -by
         sets[which, INDEX[term]] += by
-        words = f'{1e3 * by:+.1f} mrad'
-    return sets, {(name, None)}, words + (
-        '' if which == slice(None) else f', joint {log.joints[joints[0]]}')
+    return sets, {(name, None)}
 
 
 def drawn(residual: np.ndarray, size: int, way: str, rng: np.random.Generator) -> np.ndarray:
@@ -132,7 +124,9 @@ def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> li
         rng = np.random.default_rng([seed, k])
         kind, log = list(KINDS)[k % len(KINDS)], logs[k // len(KINDS) % len(logs)]
         before = sets[log.name]
-        after, wanted, words = changed(before, log, kind, rng)
+        after, wanted = changed(before, log, kind, rng)
+        words = ', '.join(f'{NAMES[p]} of joint {log.joints[j]} {after[j, p] - before[j, p]:+.3g}'
+                          for j, p in np.argwhere(after != before))
         begin, way = time.process_time(), WAYS[rng.integers(3)]
         made = judged(made_log(log, before, after, way, rng), before, robot)
         row = {'kind': kind, **scored(made, wanted), 'seconds': time.process_time() - begin}

@@ -13,11 +13,8 @@ the supervisor, the estimator of the state and noise; `--plants ''` flies none. 
 half an hour of 16 cores.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
-from pathlib import Path
 import sys
 from unittest.mock import patch
 
@@ -37,7 +34,6 @@ from beetle_omni_ros.flight.campaign import workers
 from beetle_omni_ros.flight.evaluate import fly
 from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.model.effects import validated
-from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 
@@ -79,42 +75,37 @@ QUANTITIES = {
     'less thrust [1]': (thrust, 1.0, 0.36, 0.04)}
 
 
-def flown(controller, plant, effects):
-    """Reached poses, chatter [rad] and mean U [deg] of a flight, and whether it is tolerated."""
+def tolerated(controller, plant, effects):
+    """Whether a flight reaches all poses with little chatter and mean U."""
     task = make_task('random10', SEED)
     true = replace(plant, effects={**plant.effects, **validated(effects)})
     try:
         result = metrics(fly(controller, task, robot=RobotParameters.load(), plant=true,
                              seed=SEED), task)
-    except RunError as error:       # no take-off
-        return {'reached': 0, 'error': str(error), 'tolerated': False}
-    reached = sum(pose['reached'] for pose in result['poses'])
-    chatter = result['hover_command_change_rms']['joint_rad']
-    angle = result['mean']['U_orientation_deg']
-    return {'reached': reached, 'chatter_rad': chatter, 'U_deg': angle, 'tolerated': bool(
-        reached == len(task.poses) and chatter <= CHATTER and angle <= ANGLE)}
+    except RunError:        # no take-off
+        return False
+    return (all(pose['reached'] for pose in result['poses'])
+            and result['hover_command_change_rms']['joint_rad'] <= CHATTER
+            and result['mean']['U_orientation_deg'] <= ANGLE)
 
 
 def margin(controller, plant, quantity):
-    """Bisect one quantity of one controller on one plant; None if nothing is tolerated."""
+    """Bisect one quantity of one controller on one plant; the text of the table."""
     effect, none, most, resolution = QUANTITIES[quantity]
-    robot, flights = RobotParameters.load(plant), []
+    robot = RobotParameters.load(plant)
 
-    def tolerated(value):
-        flights.append({'value': value, **flown(controller, robot, effect(robot, value))})
-        return flights[-1]['tolerated']
+    def flies(value):
+        return tolerated(controller, robot, effect(robot, value))
 
+    if not flies(none):
+        return '–'
+    if flies(most):
+        return f'> {most:g}' if most > none else f'< {most:g}'
     good, bad = none, most
-    if not tolerated(none):
-        good = bad = None
-    elif tolerated(most):
-        good = bad = most
-    else:
-        while abs(bad - good) > resolution:
-            middle = (good + bad) / 2
-            good, bad = (middle, bad) if tolerated(middle) else (good, middle)
-    return {'controller': controller, 'plant': plant, 'quantity': quantity, 'tolerated': good,
-            'not': None if good == bad else bad, 'flights': flights}
+    while abs(bad - good) > resolution:
+        middle = (good + bad) / 2
+        good, bad = (middle, bad) if flies(middle) else (good, middle)
+    return f'{good:.4g} to {bad:.4g}'
 
 
 def state_at(stamp, x, error, command):
@@ -198,8 +189,7 @@ def linear_margins(controller):
             part = part + loop[:, kept, rest] @ np.linalg.solve(
                 np.eye(4) - loop[:, rest, rest], loop[:, rest, kept])
         rows[name] = margins_of(part, w)
-    return {'controller': controller, 'error_m': float(np.linalg.norm(x[:3] - target.position)),
-            **rows}
+    return rows
 
 
 def margins_of(loop, w):
@@ -220,20 +210,12 @@ def margins_of(loop, w):
             for name, rows in found.items()}
 
 
-def shown(row):
-    """Text of a margin."""
-    good, bad = row['tolerated'], row['not']
-    return '–' if good is None else f'> {good:g}' if bad is None and good > row['flights'][0][
-        'value'] else f'< {good:g}' if bad is None else f'{good:.4g} to {bad:.4g}'
-
-
 def main() -> None:
     """Fly, compute and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--controllers', default='nmpc,rl,rl_any')
     parser.add_argument('--plants', default='robot,measured')
     parser.add_argument('--jobs', type=int, default=-1)
-    parser.add_argument('--json', type=Path)
     chosen = parser.parse_args()
     plants = {name: 'params/robot.yaml' if name == 'robot' else name
               for name in chosen.plants.split(',') if name}
@@ -241,17 +223,16 @@ def main() -> None:
     linear = [linear_margins(name) for name in names]
     cases = [(name, plant, quantity) for quantity in QUANTITIES for plant in plants.values()
              for name in names]
-    console, rows = Console(width=None if sys.stdout.isatty() else 140), []
+    console, shown = Console(width=None if sys.stdout.isatty() else 140), {}
     with workers(jobs=chosen.jobs):
-        for row in joblib.Parallel(batch_size=1, return_as='generator')(
-                joblib.delayed(margin)(*case) for case in cases):
-            rows.append(row)    # a run takes long: each result at once
-            console.print(f"{row['controller']}, {row['plant']}, {row['quantity']}: {shown(row)}",
-                          markup=False)
+        for case, text in zip(cases, joblib.Parallel(batch_size=1, return_as='generator')(
+                joblib.delayed(margin)(*case) for case in cases), strict=True):
+            shown[case] = text      # a run takes long: each result at once
+            console.print(', '.join(case) + f': {text}', markup=False)
     table = Table('quantity', *(f'{name}, {plant}' for plant in plants for name in names))
-    for k, quantity in enumerate(QUANTITIES):
+    for quantity in QUANTITIES:
         table.add_row(quantity.replace('[', r'\['), *(
-            shown(row) for row in rows[k * len(names) * len(plants):][:len(names) * len(plants)]))
+            text for case, text in shown.items() if case[-1] == quantity))
     if plants:
         console.print(table)
     table = Table('at hover', *(f'{name}, {part}' for name in names
@@ -260,8 +241,6 @@ def main() -> None:
         table.add_row(key, *('–' if row[part][key] is None else f'{row[part][key]:.3g}'
                              for row in linear for part in PARTS))
     console.print(table)
-    write_json(chosen.json, {'meta': {key: str(value) for key, value in vars(chosen).items()},
-                             'linear': linear, 'margins': rows})
 
 
 if __name__ == '__main__':

@@ -12,8 +12,6 @@ fallback or landing is a false alarm. The bound is the 95 % limit of their rate.
 has the shipped robot file, or `--robot`; of `--unmet` the robot's own. `--policy`: another file.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from math import ceil

@@ -1,7 +1,7 @@
 """
 Cost of one step of the policy, side by side with the NMPC's, on one core.
 
-    python benchmarks/policy.py [--poses 20] [--seed 0] [--policy FILE]
+    python benchmarks/policy.py
 
 The NMPC flies random poses in process, with the policy on standby. Both get the same states. The
 rest of the flight (plant, sensors, estimator, supervisor) runs between two steps, so that caches
@@ -11,13 +11,8 @@ Times are CPU times, because wall time on a shared computer includes other progr
 while other programs use shared caches.
 """
 
-from __future__ import annotations
-
-import argparse
 from collections.abc import Callable
-from dataclasses import replace
 import os
-from pathlib import Path
 import sys
 from time import thread_time
 
@@ -31,9 +26,9 @@ from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.loop import FlightLoop
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.schema import ParameterError
 
 TARGETS = {'median': 0.1, 'p99': 0.2}   # [ms] of inference
+POSES, SEED = 20, 0
 
 
 def timed(network: Callable, times: list[float]) -> Callable:
@@ -46,13 +41,13 @@ def timed(network: Callable, times: list[float]) -> Callable:
     return act
 
 
-def measure(policy: PolicyController, robot: RobotParameters, poses: int, seed: int) -> dict:
+def measure(policy: PolicyController, robot: RobotParameters) -> dict:
     """Fly; return the CPU times [ms] of the steps of each controller and of inference."""
     recorder, times = LogRecorder(), list[float]()
     policy.network = timed(policy.network, times)
     flight = FlightLoop(robot, robot, {'nmpc': NmpcController(robot), 'rl': policy}, recorder,
-                        seed=seed)
-    flight.fly(make_task(f'random{poses}', seed))
+                        seed=SEED)
+    flight.fly(make_task(f'random{POSES}', SEED))
     used = 1e3 * np.array(times)
     median, p99 = np.percentile(used, [50, 99])
     return {**{f'{name}: step': found for name, found in recorder.log().compute.items()},
@@ -62,25 +57,14 @@ def measure(policy: PolicyController, robot: RobotParameters, poses: int, seed: 
 
 def main():
     """Measure and print; status 1 if inference is slower than its target."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--poses', type=int, default=20)
-    parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--policy', help='default: the one of params/rl.yaml')
-    given = parser.parse_args()
     if hasattr(os, 'sched_setaffinity'):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    parameters = PolicyParameters.load()
-    if given.policy:
-        parameters = replace(parameters, policy=str(Path(given.policy).absolute()))
-    robot = RobotParameters.load()
-    try:
-        policy = PolicyController(robot, parameters)
-    except ParameterError as error:
-        parser.error(str(error))
+    robot, parameters = RobotParameters.load(), PolicyParameters.load()
+    policy = PolicyController(robot, parameters)
     table = Table('', 'steps', 'median', 'p99', 'max', title=f'{policy.contract.name}, '
                   f'{policy.contract.observation_size} inputs, {parameters.policy}; '
-                  f'{given.poses} random poses, seed {given.seed}: CPU [ms]')
-    results = measure(policy, robot, given.poses, given.seed)
+                  f'{POSES} random poses, seed {SEED}: CPU [ms]')
+    results = measure(policy, robot)
     for name, numbers in results.items():
         table.add_row(name, f"{numbers['count']:.0f}", *(
             f'{numbers[key]:.3f}' for key in ('median', 'p99', 'max')))

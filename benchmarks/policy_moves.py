@@ -1,8 +1,7 @@
 """
 Loss of height and errors of a policy in thousands of moves between random poses.
 
-    python benchmarks/policy_moves.py [--policy FILE] [--robots 2048] [--moves 5] [--seed 0]
-                                      [--without PART ...] [--jobs -1]
+    python benchmarks/policy_moves.py [--robots 2048] [--moves 5] [--seed 0] [--without PART ...]
 
 Rare failures need more moves than flights of the whole simulation give in an hour. Therefore the
 robots of the training environment fly: one rigid body without estimator and floor. Each robot has
@@ -10,8 +9,6 @@ its own guidance, as on board, which gets the true state. `--without` omits part
 (unwinding, routing, trimming). Poses have the distribution of random100. The first move
 of each robot is not counted. Needs torch, rsl-rl-lib and onnx (the `train` extra).
 """
-
-from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -23,7 +20,7 @@ import numpy as np
 import onnx
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
+from rich.table import Column, Table
 import torch
 
 from beetle_omni_ros.bags.log import geodesic_angles
@@ -34,7 +31,6 @@ from beetle_omni_ros.control.policy_file import find, PolicyNetwork, session
 from beetle_omni_ros.control.tasks import pose_target, random_poses
 from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 from beetle_omni_ros.train.parameters import RandomParameters, StartParameters, TrainParameters
 
@@ -156,18 +152,14 @@ def summary(flown: dict[str, np.ndarray]) -> dict[str, float]:
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--policy', help='ONNX file; default: the shipped one')
     parser.add_argument('--robots', type=int, default=2048)
     parser.add_argument('--moves', type=int, default=5, help='of each robot that count')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--without', nargs='*', choices=LAYERS, default=[])
     parser.add_argument('--jobs', type=int, default=-1, help='processes; -1: one for each core')
     given = parser.parse_args()
-    path = given.policy or PolicyParameters.load().policy
-    try:
-        contract = PolicyNetwork(path, RobotParameters.load()).contract
-    except ParameterError as error:
-        parser.error(str(error))
+    path = PolicyParameters.load().policy
+    contract = PolicyNetwork(path, RobotParameters.load()).contract
     sizes = [min(PART, given.robots - first) for first in range(0, given.robots, PART)]
     seeds = np.random.SeedSequence(given.seed).generate_state(len(sizes))
     parts = Parallel(n_jobs=given.jobs, return_as='generator')(
@@ -176,10 +168,8 @@ def main() -> None:
     parts = list(track(parts, 'flying', len(sizes), console=Console(stderr=True), transient=True))
     result = summary({name: np.concatenate([part[name] for part in parts], axis=-1)
                       for name in parts[0]})
-    table = Table(title=f'{contract.name}, seed {given.seed}'
+    table = Table('', Column('', justify='right'), title=f'{contract.name}, seed {given.seed}'
                   + ''.join(f', without {part}' for part in given.without))
-    table.add_column('')
-    table.add_column('', justify='right')
     for name, value in result.items():
         table.add_row(name, f'{value:.4g}')
     Console().print(table)

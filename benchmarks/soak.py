@@ -9,8 +9,6 @@ warm-up, or died, or if the flight ended early.
 The capacity of the pack is raised to last for the flight. The bag is deleted.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 import os

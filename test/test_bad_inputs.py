@@ -14,8 +14,7 @@ from beetle_omni_ros.model.resources import share_path
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
 JOINTS = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad\n'
 FILES = {
-    'good.csv': HEADER + '0,0,1,0,0,0\n',
-    'no_header.csv': '0,0,1,0,0,0\n',
+    'good.csv': HEADER + '0,0,1,0,0,0\n', 'no_header.csv': '0,0,1,0,0,0\n',
     'twice.csv': HEADER.strip() + ',x_m\n0,0,1,0,0,0,0\n',
     'text.csv': HEADER + '0,0,1,0,0,0\n0,0,1,east,0,0\n',
     'short.csv': HEADER + '0,0,1,0,0\n', 'far.csv': HEADER + '0,0,1,0,0,0\n100,0,1,0,0,0\n',

@@ -57,9 +57,8 @@ def test_the_rules_name_both_ports_and_set_the_latency_timer(tmp_path):
 def test_the_service_starts_the_bridges_without_arming(tmp_path):
     robot = tmp_path / 'robot.yaml'
     robot.touch()
-    done = install(tmp_path, '--workspace', '/home/pilot/ws', *(
-        word for option in ('--robot', '--servo-bus', '--motor-board')
-        for word in (option, str(robot))))
+    done = install(tmp_path, '--workspace', '/home/pilot/ws', *(word for option in (
+        '--robot', '--servo-bus', '--motor-board') for word in (option, str(robot))))
     assert done.returncode == 0, done.stderr
     unit = (tmp_path / UNIT).read_text()
     start = re.search(r'^ExecStart=(.*)$', unit, re.M)[1]

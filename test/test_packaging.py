@@ -104,9 +104,8 @@ def test_data_files_are_in_the_folders_of_ros(setup_arguments):
 
 def test_every_import_is_a_declared_requirement(setup_arguments):
     extras = setup_arguments['extras_require']
-    lines = [*setup_arguments['install_requires'],
-             *(line for extra in ('hardware', 'train', 'gym', 'notebook', 'rerun')
-               for line in extras[extra])]
+    lines = [*setup_arguments['install_requires'], *(line for extra in (
+        'hardware', 'train', 'gym', 'notebook', 'rerun') for line in extras[extra])]
     declared = {re.split(r'[\[<>=~;! ]', line)[0] for line in lines}
     keys = dependencies('exec_depend', 'depend')
     without_key = re.search('No key exists for (.*?):', (ROOT / 'package.xml').read_text(),

@@ -1,7 +1,5 @@
 """Recordings as rosbag2 folders, with the package's messages and writer."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 """Makes flights, lets `beetle_omni gap` answer blind, keeps both, judges at the end."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
+from collections.abc import Iterator
 import hashlib
 import json
 import os
@@ -25,31 +23,26 @@ KEYS = ('verdict', 'effects', 'where', 'gap_before', 'gap_after', 'noise_floor',
 TIMEOUT = 300.0     # [s] for a case
 
 
-def run_campaign(cases: list[Case], tool: str, folder: Path, *, version: str = '',
-                 done: Callable[[], None] = lambda: None) -> list[dict]:
+def run_campaign(cases: list[Case], tool: str, folder: Path, *,
+                 version: str = '') -> Iterator[dict | None]:
     """
     Ask the tool about every case, in joblib's configuration of the moment.
 
     Args:
         cases: which.
-        tool: command that takes `gap` and its arguments; '' makes the flights only.
+        tool: command that takes `gap` and its arguments.
         folder: of flights, labels and answers.
         version: of the tool's code; answers of another one are not kept for this.
-        done: called after each case.
 
-    Returns:
-        Judged cases in the order given; lost flights are left out.
+    Yields:
+        Judged cases in the order given; None for one whose flights are lost.
 
     """
     place = folder / 'answers' / hashlib.sha256((tool + version).encode()).hexdigest()[:8]
     runs = joblib.Parallel(return_as='generator', batch_size=1, pre_dispatch='all')(
         joblib.delayed(_one)(case, tool, folder, place / f'{case.key()}.json') for case in cases)
-    judged = []
     for case, run in zip(cases, runs, strict=True):
-        if run:
-            judged.append(judge(open_label(case, folder / 'sealed'), run))
-        done()
-    return judged
+        yield judge(open_label(case, folder / 'sealed'), run) if run else None
 
 
 def open_label(case: Case, sealed: Path) -> dict:
@@ -67,8 +60,6 @@ def _one(case, tool, folder, kept):
     try:
         flights = make_case(case, folder / 'flights', folder / 'sealed')
     except LostFlight:
-        return None
-    if not tool:
         return None
     if kept.is_file():
         return json.loads(kept.read_text())

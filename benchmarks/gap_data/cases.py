@@ -1,7 +1,5 @@
 """Which cases a campaign holds: drawn from one seed, each complete in itself."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -17,6 +15,7 @@ from gap_data.effects import COMPANIONS, SHAPES
 HERE = Path(__file__).parent
 # Files that make no flight; of this one, the fields of a case are in its key.
 OTHERS = {'__init__.py', 'campaign.py', 'campaign.yaml', 'cases.py', 'judge.py', 'score.py'}
+LEAST = {'mass': -0.2, 'rotor_lag': -0.04}      # sizes
 KINDS = ('singles', 'none', 'pairs', 'outside', 'undecidable')
 DIFFICULTIES = ('clean', 'hard')
 
@@ -105,11 +104,7 @@ def _effect(settings, name, difficulty, rng):
     """Name, signed size and shape; the clean half has the textbook's shapes."""
     entry = settings['effects'][name]
     size = float(np.exp(rng.uniform(*np.log(entry['range']))))
-    size *= int(rng.choice(entry['signs']))
-    if name == 'mass' and size < 0:
-        size = max(size, -0.2)
-    if name == 'rotor_lag' and size < 0:
-        size = max(size, -0.04)
+    size = max(size * int(rng.choice(entry['signs'])), LEAST.get(name, -np.inf))
     shapes = SHAPES.get(name, ()) if difficulty == 'hard' else ()
     return name, size, str(rng.choice(shapes)) if shapes else 'plain'
 

@@ -6,8 +6,6 @@ vectors of the rotors are their least-norm solution plus a wander and, in lively
 the null space, which the body does not feel but the tilts do.
 """
 
-from __future__ import annotations
-
 from math import atan2, hypot, pi
 
 import numpy as np

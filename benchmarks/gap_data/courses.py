@@ -1,7 +1,5 @@
 """Where a flight goes: smooth references of position and attitude."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -7,8 +7,6 @@ the other shapes differ from it as a real effect would, and agree with it at the
 the interface defines the parameter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from inspect import isfunction
 

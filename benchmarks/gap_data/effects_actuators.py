@@ -1,7 +1,5 @@
 """Hidden effects of rotors and servos; see :mod:`gap_data.effects`."""
 
-from __future__ import annotations
-
 from math import exp, tanh
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hidden effects on bodies and air, each in more than one shape; see :mod:`gap_data.effects`."""
 
-from __future__ import annotations
-
 from math import cos, exp, pi, radians, sin, sqrt, tanh
 
 import numpy as np

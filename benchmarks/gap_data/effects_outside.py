@@ -1,7 +1,5 @@
 """Effects that no catalogue entry describes; the right answer is `unknown`."""
 
-from __future__ import annotations
-
 from math import cos, exp, pi, sin, sqrt, tanh
 
 import numpy as np

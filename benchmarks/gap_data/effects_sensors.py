@@ -1,7 +1,5 @@
 """Hidden effects of clocks, sensors and delays of commands; see :mod:`gap_data.effects`."""
 
-from __future__ import annotations
-
 from gap_data.hidden import direction
 
 

@@ -1,7 +1,5 @@
 """One flight in closed loop: what really happened, a thousand times a second."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,10 +120,9 @@ def draw_gust(settings: dict, duration: float, step: float,
     A second-order (Dryden-like) colouring: white noise through two equal lags.
     """
     count = int(round(duration / step)) + 1
-    return (_coloured(count, step, rng.uniform(*settings['time']),
-                      rng.uniform(*settings['force']), rng),
-            _coloured(count, step, rng.uniform(*settings['time']),
-                      rng.uniform(*settings['torque']), rng))
+    force, torque = (_coloured(count, step, rng.uniform(*settings['time']),
+                               rng.uniform(*settings[kind]), rng) for kind in ('force', 'torque'))
+    return force, torque
 
 
 def _coloured(count, step, time, rms, rng):
@@ -166,11 +163,8 @@ def _check(state, reference, t):
 
 
 def _split(log):
-    columns, start = {}, 0
-    for name, size in COLUMNS.items():
-        columns[name] = log[:, start:start + size]
-        start += size
-    return columns
+    ends = np.cumsum(list(COLUMNS.values()))[:-1]
+    return dict(zip(COLUMNS, np.split(log, ends, axis=1)))
 
 
 def _matrix(q):

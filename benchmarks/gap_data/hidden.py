@@ -5,8 +5,6 @@ Every effect of :mod:`gap_data.effects` changes the true robot, or one or more o
 plain functions of floats, because they run a thousand times a simulated second.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """One answer against one sealed label."""
 
-from __future__ import annotations
-
 import numpy as np
 
 LARGEST_SET = 4  # a set of more names than this decides nothing
@@ -23,7 +21,8 @@ def judge(label: dict, run: dict) -> dict:
     Everything that the score counts about one case.
 
     Args:
-        label: of :func:`gap_data.campaign.open_label`.
+        label: of :func:`gap_data.campaign.open_label`; its ``command_age`` [s] is that from which
+            answers may count, instead of that of these flights.
         run: of :func:`gap_data.campaign.ask`.
 
     """
@@ -44,7 +43,8 @@ def judge(label: dict, run: dict) -> dict:
         'closure': answer.get('closure'), 'gap_before': answer.get('gap_before'),
         'gap_after': answer.get('gap_after'), 'wall_s': run['wall_s'], 'cpu_s': run['cpu_s'],
         'message': run['message'],
-        'parameters': [_row(truth['name'], name, true, effect['parameters'][name])
+        'parameters': [_row(truth['name'], name, true, effect['parameters'][name],
+                            label.get('command_age', COMMAND_AGE))
                        for truth, effect in zip(truths, matches) if effect is not None
                        for name, true in truth['parameters'].items()
                        if name in effect['parameters']]}
@@ -76,14 +76,14 @@ def _right(judged, label, found):
     return accepted
 
 
-def _row(effect, name, true, entry):
+def _row(effect, name, true, entry, age):
     """Error and coverage of a true parameter that the answer gives."""
     true = np.atleast_1d(true)
     value = np.atleast_1d(entry['value'])
     interval = np.reshape(entry['interval'], (len(true), 2))
     if effect in COMMAND_DELAYS and abs(value[0] - true[0]) > abs(
-            value[0] - true[0] - COMMAND_AGE):
-        true = true + COMMAND_AGE
+            value[0] - true[0] - age):
+        true = true + age
     size = np.linalg.norm(true - NOMINAL.get((effect, name), np.zeros(len(true))))
     error = float(np.linalg.norm(value - true))
     inside = (interval[:, 0] <= true) & (true <= interval[:, 1])

@@ -1,7 +1,5 @@
 """One case on disk: bags and the robot file that the workflow is told; its label elsewhere."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 import json
 import os

@@ -7,14 +7,10 @@ Either way ``base_link`` is the free body's frame, three forces and three torque
 its own axes (actuators ``base0..5``), and ``servo1..4`` are PD torques.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gap_data.truth import Robot
 
-AXES = ('1 0 0 0 0 0', '0 1 0 0 0 0', '0 0 1 0 0 0',
-        '0 0 0 1 0 0', '0 0 0 0 1 0', '0 0 0 0 0 1')
 FRICTION_SWITCH = 1e-12  # [N m] keeps the friction constraint in the model, to be set in flight
 
 
@@ -48,8 +44,8 @@ def model_xml(robot: Robot, *, multibody: bool, imu_position=(0.0, 0.0, 0.0),
     loose, taken = _loose_mass(slosh)
     inside, outside = (_modules(robot, loss), '') if multibody else ('', _shafts(robot, loss))
     inertial = _main_inertial(robot, taken) if multibody else _rigid_inertial(robot, taken)
-    base = ''.join(f'<general name="base{k}" site="base" gear="{axes}"/>'
-                   for k, axes in enumerate(AXES))
+    base = ''.join(f'<general name="base{k}" site="base" gear="{_vector(axes)}"/>'
+                   for k, axes in enumerate(np.eye(6)))
     servos = ''.join(
         f'<general name="servo{i + 1}" joint="gimbal{i + 1}" gainprm="{robot.kp[i]:.9g}" '
         f'biastype="affine" biasprm="0 {-robot.kp[i]:.9g} {-robot.kd[i]:.9g}" '

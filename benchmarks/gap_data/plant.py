@@ -1,7 +1,5 @@
 """One robot in the air: MuJoCo for bodies and servos, the rest in plain floats."""
 
-from __future__ import annotations
-
 from math import cos, exp, sin
 
 import mujoco

@@ -1,7 +1,5 @@
 """Thrust from commands: dead time, cut, lag; and the pack that feeds the rotors."""
 
-from __future__ import annotations
-
 from collections import deque
 from math import exp, log1p, pi, sqrt
 

@@ -1,6 +1,6 @@
 """All answers as numbers with the interval in which they lie with 95 %, and as a page."""
 
-from __future__ import annotations
+from functools import partial
 
 import numpy as np
 from scipy.stats import binomtest
@@ -8,15 +8,17 @@ from scipy.stats import binomtest
 from gap_data.cases import DIFFICULTIES
 
 NOTHING = {'value': None, 'interval': None, 'count': 0}
+LEGEND = ('`**` misses its target; in brackets the 95 % interval, in parentheses the number of '
+          'cases or values.')
 
 
-def share(hits: list[bool]) -> dict:
-    """Proportion with Wilson's interval; None without any case."""
+def proportion(hits: list[bool], method: str) -> dict:
+    """Proportion with its interval, 'wilson' or 'exact'; None without any case."""
     if not hits:
         return NOTHING
     found = binomtest(sum(map(bool, hits)), len(hits))
     return {'value': found.statistic, 'count': len(hits),
-            'interval': list(found.proportion_ci(method='wilson'))}
+            'interval': list(found.proportion_ci(method=method))}
 
 
 def median(values: list[float | None], draws: int = 1000) -> dict:
@@ -35,9 +37,9 @@ def score(judged: list[dict]) -> dict[str, list[dict]]:
     return {d: criteria([j for j in judged if j['difficulty'] == d], d) for d in DIFFICULTIES}
 
 
-def criteria(judged: list[dict], difficulty: str) -> list[dict]:
+def criteria(judged: list[dict], difficulty: str, method: str = 'wilson') -> list[dict]:
     """Each with name, value, interval, count, target and whether the value reaches it."""
-    clean = difficulty == 'clean'
+    clean, share = difficulty == 'clean', partial(proportion, method=method)
     singles, none, pairs, outside, hover = ([j for j in judged if j['kind'] == kind] for kind in (
         'singles', 'none', 'pairs', 'outside', 'undecidable'))
     rows = [row for j in singles + pairs for row in j['parameters']]
@@ -93,12 +95,14 @@ def markdown(report: dict) -> str:
              f'`{report["meta"]["command"]}`', '']
     for difficulty, rows in report['criteria'].items():
         if any(row['count'] for row in rows):
-            lines += [f'## {difficulty.capitalize()} flights', '', '| | target | |',
-                      '|---|---|---|', *(f'| {row["name"]} | {_target(row)} | {_number(row)} |'
-                                         for row in rows), '']
-    lines += ['`**` misses its target; in brackets the 95 % interval, in parentheses the number '
-              'of cases or values.']
-    return '\n'.join(lines) + '\n'
+            lines += [f'## {difficulty.capitalize()} flights', '', *table(rows), '']
+    return '\n'.join([*lines, LEGEND]) + '\n'
+
+
+def table(rows: list[dict]) -> list[str]:
+    """Lines of a table of criteria."""
+    return ['| | target | |', '|---|---|---|', *(
+        f'| {row["name"]} | {_target(row)} | {_number(row)} |' for row in rows)]
 
 
 def _number(row):

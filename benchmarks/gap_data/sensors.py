@@ -1,7 +1,5 @@
 """From truth to what the sensors report, with the stamps that they put on it."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.signal import bessel, butter, lfilter, lfilter_zi
 from scipy.spatial.transform import Rotation
@@ -39,13 +37,15 @@ def measure(truth: Truth, hidden: Hidden, numbers: dict, rng: np.random.Generato
         'commands': np.column_stack([truth.command_t, truth.command_tilt, truth.command_thrust])}
 
 
-def _rows(truth, period):
-    every = int(round(period / (truth.t[1] - truth.t[0])))
-    return slice(0, len(truth.t), every)
+def _rows(truth, period, delay=0.0):
+    """Stamps, and the rows of the truth at these times less a delay."""
+    step = truth.t[1] - truth.t[0]
+    rows = np.arange(0, len(truth.t), int(round(period / step)))
+    return truth.t[rows], np.maximum(rows - int(round(delay / step)), 0)
 
 
 def _imu(truth, hidden, settings, rng, noise, shape):
-    rows = _rows(truth, settings['imu_period'])
+    stamps, rows = _rows(truth, settings['imu_period'])
     readings = np.hstack([truth.columns['specific_force'], truth.columns['rate']])
     if hidden.imu_delay > 0:
         readings = low_pass(readings, hidden.imu_delay, truth.t[1] - truth.t[0], shape)
@@ -55,7 +55,7 @@ def _imu(truth, hidden, settings, rng, noise, shape):
     force = force + hidden.accelerometer_bias + noise['accelerometer'] * rng.standard_normal(
         force.shape)
     rate = rate + hidden.gyroscope_bias + noise['gyroscope'] * rng.standard_normal(rate.shape)
-    return np.column_stack([truth.t[rows], force, rate])
+    return np.column_stack([stamps, force, rate])
 
 
 def low_pass(signal: np.ndarray, delay: float, step: float, shape: str) -> np.ndarray:
@@ -79,10 +79,7 @@ def low_pass(signal: np.ndarray, delay: float, step: float, shape: str) -> np.nd
 
 
 def _mocap(truth, hidden, settings, rng, noise):
-    rows = _rows(truth, settings['mocap_period'])
-    stamps = truth.t[rows]
-    shift = int(round(hidden.mocap_delay / (truth.t[1] - truth.t[0])))
-    seen = np.maximum(np.arange(len(truth.t))[rows] - shift, 0)
+    stamps, seen = _rows(truth, settings['mocap_period'], hidden.mocap_delay)
     position = truth.columns['position'][seen]
     w, x, y, z = truth.columns['quaternion'][seen].T
     turn = (Rotation.from_quat(np.column_stack([x, y, z, w]))
@@ -93,10 +90,7 @@ def _mocap(truth, hidden, settings, rng, noise):
 
 
 def _joints(truth, hidden, settings, rng, noise):
-    rows = _rows(truth, settings['joint_period'])
-    stamps = truth.t[rows]
-    shift = int(round(hidden.joint_feedback_delay / (truth.t[1] - truth.t[0])))
-    seen = np.maximum(np.arange(len(truth.t))[rows] - shift, 0)
+    stamps, seen = _rows(truth, settings['joint_period'], hidden.joint_feedback_delay)
     count = 2 * np.pi / settings['counts_per_turn']
     tilt = truth.columns['tilt'][seen]
     tilt = tilt + noise['tilt'] * rng.standard_normal(tilt.shape)
@@ -104,8 +98,8 @@ def _joints(truth, hidden, settings, rng, noise):
 
 
 def _battery(truth, settings, rng):
-    rows = _rows(truth, settings['period'])
+    stamps, rows = _rows(truth, settings['period'])
     voltage, current = truth.columns['voltage'][rows], truth.columns['current'][rows]
     return np.column_stack([
-        truth.t[rows], voltage + settings['voltage_noise'] * rng.standard_normal(voltage.shape),
+        stamps, voltage + settings['voltage_noise'] * rng.standard_normal(voltage.shape),
         -current + settings['current_noise'] * rng.standard_normal(current.shape)])

@@ -1,19 +1,12 @@
 """What is true of one robot: the interface's numbers, within a workshop's tolerances."""
 
-from __future__ import annotations
-
 from math import cos, radians, sin
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-HERE = Path(__file__).parent
-
-
-def load_numbers() -> dict:
-    """Everything that stands in ``numbers.yaml``."""
-    return yaml.safe_load((HERE / 'numbers.yaml').read_text())
+NUMBERS = Path(__file__).with_name('numbers.yaml')
 
 
 class Robot:
@@ -39,7 +32,7 @@ class Robot:
     """
 
     def __init__(self):
-        self.numbers = load_numbers()
+        self.numbers = yaml.safe_load(NUMBERS.read_text())
         r = self.numbers['robot']
         self.mass, self.inertia, self.centre = r['mass'], np.array(r['inertia']), np.zeros(3)
         self.positions = np.array(r['rotor_positions'])

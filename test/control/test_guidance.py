@@ -134,8 +134,7 @@ def test_the_target_returns_once_the_joints_are_unwound():
     level = fly(guidance, 1.0)[-1]
     assert fly(guidance, 0.1, 1.0, quaternion=level.quaternion)[-1].quaternion \
         is level.quaternion     # still wound
-    assert fly(guidance, 0.1, 1.1, quaternion=level.quaternion,
-               tilt=np.full(4, 0.5))[-1] is TARGET
+    assert fly(guidance, 0.1, 1.1, quaternion=level.quaternion, tilt=np.full(4, 0.5))[-1] is TARGET
 
 
 UPSIDE_DOWN = PoseTarget(np.array([0.0, 0.0, 1.5]), rotations.from_rpy(2.98, 0.02, 1.6))

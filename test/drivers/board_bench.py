@@ -12,8 +12,7 @@ from beetle_omni_ros.drivers.motor_board import MotorBoard
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
-QUICK = {'boot_time': 0.05, 'idle_timeout': 1.0, 'throttle_low_time': 0.3,
-         'reception_rate': 10.0}
+QUICK = {'boot_time': 0.05, 'idle_timeout': 1.0, 'throttle_low_time': 0.3, 'reception_rate': 10.0}
 ROBOT = RobotParameters.load()
 HOVER = np.array([7.0, 7.5, 8.0, 8.5])
 
@@ -65,8 +64,7 @@ class Pilot:
 
 @contextmanager
 def connected():
-    with EmulatedMotorBoard(**QUICK) as emulated, \
-            opened(emulated.port) as board:
+    with EmulatedMotorBoard(**QUICK) as emulated, opened(emulated.port) as board:
         assert until(lambda: not board.ready), board.ready
         yield emulated, board
 

@@ -53,8 +53,7 @@ def test_an_independent_parser_accepts_all_output_of_the_driver():
     messages = [reference.parse(frame) for frame in reference.split(bytes(received))]
     assert {number for number, *_ in messages} == {0, 76, 111, 139}
     assert all(sender == (1, 191) for _, _, sender, _ in messages)
-    assert [sequence for _, sequence, _, _ in messages] \
-        == [k % 256 for k in range(len(messages))]
+    assert [sequence for _, sequence, _, _ in messages] == [k % 256 for k in range(len(messages))]
     stamps = [values[0] for number, _, _, values in messages if number == 139]
     assert len(stamps) == 100 and np.all(np.diff(stamps) > 0)
     contents = [(number, values) for number, _, _, values in messages]

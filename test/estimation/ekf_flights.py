@@ -119,8 +119,7 @@ class Sensors:
         truth = trajectory(times)
         position = truth['position'] + truth['rotation'].apply(self.mocap_position)
         position = position + self.position_noise * rng.standard_normal(position.shape)
-        noise = Rotation.from_rotvec(self.orientation_noise
-                                     * rng.standard_normal(position.shape))
+        noise = Rotation.from_rotvec(self.orientation_noise * rng.standard_normal(position.shape))
         quaternion = (truth['rotation'] * Rotation.from_rotvec(self.mocap_rotation)
                       * noise).as_quat()
         return [PoseReading(*row) for row in zip(times.tolist(), position, quaternion)]

@@ -96,8 +96,7 @@ def test_a_permanent_clock_jump_reinitialises_the_filter(jump):
     """Simulated time restarts, or the IMU was silent for long."""
     flight = fly(7, 4.0)
     flight.imu = [replace(s, stamp=s.stamp + jump) if s.stamp > 2.0 else s for s in flight.imu]
-    flight.poses = [replace(s, stamp=s.stamp + jump) if s.stamp > 2.0 else s
-                    for s in flight.poses]
+    flight.poses = [replace(s, stamp=s.stamp + jump) if s.stamp > 2.0 else s for s in flight.poses]
     ekf, statuses = new_ekf(), []
     events = [(0.005 * k, 0, s) for k, s in enumerate(flight.imu)]
     events += [(0.01 * k + flight.delay, 1, s) for k, s in enumerate(flight.poses)]

@@ -124,8 +124,7 @@ def test_the_command_writes_its_files_and_a_campaign_continues(tmp_path, monkeyp
 
     def fly(function, calls, *rest):
         flights.append([(call[0].case, call[0].seed) for call in calls])
-        yield from ((k, result(call[0].case, seed=call[0].seed))
-                    for k, call in enumerate(calls))
+        yield from ((k, result(call[0].case, seed=call[0].seed)) for k, call in enumerate(calls))
 
     monkeypatch.setattr(campaign, '_fly_all', fly)
     console = Console(file=io.StringIO())

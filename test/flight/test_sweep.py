@@ -24,8 +24,7 @@ def poses(tmp_path):
 def without_times(result):
     """Return the result of a flight without times that depend on the computer's load."""
     metrics = {key: value for key, value in result['metrics'].items() if key != 'compute_ms'}
-    return json.dumps(metrics), {name: values.tolist() for name, values in
-                                 result['trace'].items()}
+    return json.dumps(metrics), {name: values.tolist() for name, values in result['trace'].items()}
 
 
 def sweep(flights, **options):
@@ -44,8 +43,7 @@ def test_workers_give_the_numbers_of_this_process_and_are_flown_once(poses, tmp_
         return ''
 
     first = sweep(flights[:1], store=store, jobs=2)
-    assert without_times(fly_flight(flights[0], flights[0].make_task())) \
-        == without_times(first[0])
+    assert without_times(fly_flight(flights[0], flights[0].make_task())) == without_times(first[0])
     with pytest.raises(KeyboardInterrupt):
         sweep(flights, store=store, jobs=1, line=interrupt)
     assert lines == [(3, True), (4, False)]

@@ -33,8 +33,7 @@ def write_flight(path, seed, scale=(1, 1, 1, 1), hub=5e-4, load=(0.0, 0.0), move
     need = np.column_stack([np.full(len(t), WEIGHT), np.full(len(t), load[1] * WEIGHT),
                             -load[0] * WEIGHT + hub * speed, np.zeros(len(t))])
     need[:, 1:3] += moved * WEIGHT * ARM * rng.normal(size=(len(t), 2))
-    arms = np.array([[1, 1, 1, 1], [-ARM, -ARM, ARM, ARM], [-ARM, ARM, ARM, -ARM],
-                     [1, -1, 1, -1]])
+    arms = np.array([[1, 1, 1, 1], [-ARM, -ARM, ARM, ARM], [-ARM, ARM, ARM, -ARM], [1, -1, 1, -1]])
     thrust = np.linalg.solve(arms, need.T).T / scale
     place = np.cumsum(speed) * 0.00992
     up = rng.normal(size=(len(t), 3)) * 0.05

@@ -54,8 +54,7 @@ def test_deviations_of_flights_are_eliminated_as_in_the_dense_problem():
         dense[np.ix_(at, at)] += g[np.ix_(which, which)]
         right[at] += h[which]
     dense[range(3, 7), range(3, 7)] += np.tile(flight[own]**-2, 2)
-    assert np.allclose(np.linalg.solve(found.info, found.right),
-                       np.linalg.solve(dense, right)[:3])
+    assert np.allclose(np.linalg.solve(found.info, found.right), np.linalg.solve(dense, right)[:3])
     theta = np.linalg.solve(dense, right)
     assert np.allclose(found.of_flight(1, theta[:3])[own], theta[5:])
     # scores of the blocks vanish in sum at the solution
@@ -328,8 +327,7 @@ def test_flights_on_the_ground_and_other_channels_are_told_by_name(tmp_path):
     lines = good.read_text().splitlines()
     ground = tmp_path / 'ground.csv'
     cells = [line.split(',') for line in lines]
-    ground.write_text('\n'.join([lines[0], *(','.join([*c[:3], '0', *c[4:]])
-                                             for c in cells[1:])]))
+    ground.write_text('\n'.join([lines[0], *(','.join([*c[:3], '0', *c[4:]]) for c in cells[1:])]))
     assert gap_of([ground])['verdict'] == 'bad_data'
     result = gap_of([good, ground])
     assert result['findings'] == ['ground.csv: not used, no block of commands and measurements '

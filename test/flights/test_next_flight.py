@@ -119,8 +119,7 @@ def test_an_undecided_flight_of_a_table_is_followed_by_level_poses(crazyflie, tm
 
 
 def test_a_flight_of_level_rotors_obeys_the_body_equations(crazyflie):
-    position, yaw = Experiments.level_motion(
-        Experiments.poses(0, level=True), crazyflie.period)
+    position, yaw = Experiments.level_motion(Experiments.poses(0, level=True), crazyflie.period)
     flight = flat_flight(crazyflie, position, yaw)
     assert flight.channels == crazyflie.channels
     inside = (flight.time > 9.0) & (flight.time < 23.0)

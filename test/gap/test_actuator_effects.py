@@ -58,9 +58,8 @@ CASES = [
      {'joint_velocity_limit.velocity_limit': np.log(0.5)}, 0.1),
     ({'effort': 0.08}, {'joint_torque_limit.effort_limit': 0.08},
      {'joint_torque_limit.effort_limit': np.log(0.04)}, 0.004),
-    ({'coulomb': 0.008, 'stiction': 0.008},
-     {'joint_friction.coulomb': 0.008}, {'joint_friction.coulomb': 0.006,
-                                         'joint_friction.stiction': 0.006}, 0.0012),
+    ({'coulomb': 0.008, 'stiction': 0.008}, {'joint_friction.coulomb': 0.008},
+     {f'joint_friction.{name}': 0.006 for name in ('coulomb', 'stiction')}, 0.0012),
     ({'bend': 0.002}, {'joint_deflection.deflection_per_newton': 0.002}, None, 1e-4)]
 SERVO = {'delay': 0.010, 'kp': JOINT.kp, 'kd': JOINT.kd, 'speed': JOINT.velocity_limit,
          'effort': JOINT.effort_limit, 'coulomb': 0.0, 'stiction': 0.0, 'bend': 0.0,
@@ -189,8 +188,7 @@ def test_a_torque_limit_is_recovered_from_samples_at_the_limit():
 def engine_of(made, starts):
     """Engine of the joints of a flight with these starts, name -> key -> value."""
     made.starts = starts
-    made.tangents = {f'{start}~{key}': (start, key)
-                     for start, own in starts.items() for key in own}
+    made.tangents = {f'{start}~{key}': (start, key) for start in starts for key in starts[start]}
     # four blocks; the forces of these readings are not those of the thrusts
     return Engine([made] * 4, dict.fromkeys(starts, Prior(0.03, 1.0, 0.0))
                   | dict.fromkeys(made.tangents, Prior(0.001, 0.3, 0.0)),

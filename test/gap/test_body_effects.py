@@ -117,8 +117,7 @@ def joint_offset(x):
                        for i, axis in enumerate(ROBOT.tilt_axes)], axis=1)
     push = MOTION.thrust[:, :, None] * (turned - MOTION.normals)
     force, torque = on_rotors(push)
-    return force, torque - ROBOT.rotors.torque_to_thrust_ratio * (
-        SPIN[:, None] * push).sum(axis=1)
+    return force, torque - ROBOT.rotors.torque_to_thrust_ratio * (SPIN[:, None] * push).sum(axis=1)
 
 
 def mass(x):
@@ -127,19 +126,17 @@ def mass(x):
 
 CASES = {
     'rotor_drag.coefficient': (rotor_drag, 0.4), 'rotor_hub_moment.coefficient': (hub_moment, 0.1),
-    'body_drag.coefficient': (body_drag, 0.1),
-    'axial_inflow.per_rotor': (axial_inflow, 0.4),
+    'body_drag.coefficient': (body_drag, 0.1), 'axial_inflow.per_rotor': (axial_inflow, 0.4),
     'translational_lift.per_rotor': (translational_lift, 0.03),
     'tilt_thrust_loss.loss_at_60deg': (tilt_thrust_loss, 0.08),
     'ground_effect.gain_at_0.25m': (ground_effect, 0.1), 'voltage_sag.exponent': (sag, 1.4),
     'torque_coefficient.torque_to_thrust_ratio': (ratio, 0.02),
     'thrust_coefficient.scale': (lambda x: thrust_change((x - 1) * np.ones(4)), 0.93),
-    'rotor_thrust_coefficient.scale[2]': (
-        lambda x: thrust_change((x - 1) * np.eye(4)[2]), 0.9),
+    'rotor_thrust_coefficient.scale[2]': (lambda x: thrust_change((x - 1) * np.eye(4)[2]), 0.9),
     'propeller_gyroscopic_torque.angular_momentum_at_hover': (gyroscopic, 0.06),
     'rotor_acceleration_torque.angular_momentum_at_hover': (spin_up, 0.05),
-    'module_reaction.module_inertia': (module, 4e-4), 'joint_offset.offset[1]': (
-        joint_offset, 0.05), 'mass.mass': (mass, 3.3)}
+    'module_reaction.module_inertia': (module, 4e-4), 'mass.mass': (mass, 3.3),
+    'joint_offset.offset[1]': (joint_offset, 0.05)}
 
 
 @pytest.fixture(scope='module')

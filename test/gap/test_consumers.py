@@ -80,8 +80,7 @@ def training(robot):
     x, u = states()
     step, body, parameters = substep(robot, 0.0025), nominal_body(robot), TrainParameters()
     parameters = replace(parameters, random=replace(
-        parameters.random, command_latency=np.array([0.0, 0.0]),
-        tilt_latency=np.array([0.0, 0.0])))
+        parameters.random, command_latency=np.zeros(2), tilt_latency=np.zeros(2)))
     return [np.array([step(a, b, np.zeros(6), body) for a, b in zip(x, u)]).ravel(),
             np.array(latencies(parameters, robot)).ravel()]
 

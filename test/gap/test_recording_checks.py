@@ -105,8 +105,7 @@ def noisy(topic, count, deviation):
 
 
 def twice(topic):
-    return lambda made: changed(
-        made, topic, keep=np.repeat(np.arange(len(made.times[topic])), 2))
+    return lambda made: changed(made, topic, keep=np.repeat(np.arange(len(made.times[topic])), 2))
 
 
 def turned(topic, columns_, rotation, late=False):
@@ -393,7 +392,6 @@ def test_a_repair_restores_the_sound_recording(kind):
         inside = (t > fixed.times[topic].min()) & (t < fixed.times[topic].max())
         order = np.argsort(fixed.times[topic])
         for k, column in enumerate(sound.values[topic].T):
-            again = np.interp(t[inside], fixed.times[topic][order],
-                              fixed.values[topic][order, k])
+            again = np.interp(t[inside], fixed.times[topic][order], fixed.values[topic][order, k])
             error = np.abs(np.abs(again) - np.abs(column[inside]))
             assert np.median(error) < 1e-3 + 0.03 * np.std(column), (topic, k)

@@ -48,15 +48,11 @@ def test_a_late_mocap_is_named_although_it_is_noisy(tmp_path):
 
 
 def test_a_hidden_effect_is_named_though_the_sensors_differ_from_flight_to_flight(tmp_path):
-    rng, made = np.random.default_rng(1), flights(
-        tmp_path, 6, ('rotor_drag', 0.6, 'plain'), holdout=1)
-    made = [replace(
-        flight,
-        times=flight.times | {topic: flight.times[topic] + rng.uniform(-0.008, 0.008)
-                              for topic in (POSE, JOINTS)},
-        values=flight.values | {IMU: flight.values[IMU] + rng.normal(size=6) * np.repeat(
-            [0.05, 0.004], 3)})
-            for flight in made]
+    rng, bias = np.random.default_rng(1), np.repeat([0.05, 0.004], 3)
+    made = [replace(each, times=each.times | {
+        topic: each.times[topic] + rng.uniform(-0.008, 0.008) for topic in (POSE, JOINTS)},
+        values=each.values | {IMU: each.values[IMU] + rng.normal(size=6) * bias})
+        for each in flights(tmp_path, 6, ('rotor_drag', 0.6, 'plain'), holdout=1)]
     result = judged(made[:2], made[2:], ROBOT, P)
     assert result['verdict'] == 'named' and names(result) == ['rotor_drag']
     found = result['effects'][0]['parameters']['coefficient']

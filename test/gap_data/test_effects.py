@@ -128,17 +128,14 @@ def test_backlash_has_the_width_of_its_gap(shape):
 
 
 def test_mass_and_centre_of_mass_change_the_specific_force():
-    robot, hidden, label = put('mass', 0.3)
-    body = Plant(robot, hidden, multibody=False, position=(0, 0, 5), tilt=[0.0] * 4,
-                 quaternion=(1, 0, 0, 0), thrust=[7.0] * 4)
-    body.step()
-    assert body.specific_force[2] == pytest.approx(28.0 / label['mass'], rel=1e-3)
-    robot, hidden, label = put('centre_of_mass', 0.01)
-    body = Plant(robot, hidden, multibody=False, position=(0, 0, 5), tilt=[0.0] * 4,
-                 quaternion=(1, 0, 0, 0), thrust=[7.0] * 4)
-    before = np.zeros(3)
-    body.step()
-    spin_up = (body.data.qvel[3:6] - before) / 0.001
+    for name, size in (('mass', 0.3), ('centre_of_mass', 0.01)):
+        robot, hidden, label = put(name, size)
+        body = Plant(robot, hidden, multibody=False, position=(0, 0, 5), tilt=[0.0] * 4,
+                     quaternion=(1, 0, 0, 0), thrust=[7.0] * 4)
+        body.step()
+        if name == 'mass':
+            assert body.specific_force[2] == pytest.approx(28.0 / label['mass'], rel=1e-3)
+    spin_up = body.data.qvel[3:6] / 0.001
     torque = np.cross(-np.array(label['offset']), [0, 0, 28.0])
     # the described rotors' own small asymmetry adds a constant
     torque += np.sum(np.cross(robot.positions, [0, 0, 7.0]), axis=0)

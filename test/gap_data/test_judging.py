@@ -87,8 +87,7 @@ def test_scores_of_a_perfect_workflow_and_of_one_without_answers():
 
     for name, good, bad in (('single: named, or the right set', 1, 0),
                             ('none: false alarm', 0, 0), ('pair: both named', 1, 0),
-                            ('closure, single', 0.9, 0.0),
-                            ('interval covers the truth', 1, None)):
+                            ('closure, single', 0.9, 0.0), ('interval covers the truth', 1, None)):
         assert value(right, name) == (pytest.approx(good))
         assert value(silent, name) == (bad if bad is None else pytest.approx(bad))
 

@@ -5,14 +5,14 @@ from gap_data.courses import Course
 from gap_data.flight import COLUMNS, Truth
 from gap_data.hidden import Hidden
 from gap_data.sensors import low_pass, measure
-from gap_data.truth import load_numbers
+from gap_data.truth import Robot
 import numpy as np
 import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
 from scipy.spatial.transform import Rotation
 
-NUMBERS = load_numbers()
+NUMBERS = Robot().numbers
 SILENT = {'accelerometer': 0, 'gyroscope': 0, 'position': 0, 'orientation': 0, 'tilt': 0}
 
 

@@ -43,16 +43,15 @@ def made(tmp_path_factory):
 
 def test_the_intervals_hold_the_true_robot(made):
     robot = RobotParameters.load(made / 'mine.yaml')
-    kp = [PUBLISHED.joints.inertia * one['frequency']**2 for one in TRUE]
+    frequency, damping, coulomb, delay = (np.array([one[name] for one in TRUE]) for name in (
+        'frequency', 'damping', 'coulomb', 'delay'))
+    kp = PUBLISHED.joints.inertia * frequency**2
     truth = {
         'effects.joint_bandwidth.kp': kp,
-        'effects.joint_bandwidth.kd': [2 * one['damping'] * k / one['frequency']
-                                       for one, k in zip(TRUE, kp, strict=True)],
-        'effects.joint_friction.coulomb': [
-            one['coulomb'] * k for one, k in zip(TRUE, kp, strict=True)],
-        'effects.joint_command_latency.delay': TRUE[0]['delay'] - own_delay(),
-        'tilt_lag': [2 * one['damping'] / one['frequency'] + one['delay'] - own_delay()
-                     for one in TRUE],
+        'effects.joint_bandwidth.kd': kp * 2 * damping / frequency,
+        'effects.joint_friction.coulomb': kp * coulomb,
+        'effects.joint_command_latency.delay': delay[0] - own_delay(),
+        'tilt_lag': 2 * damping / frequency + delay - own_delay(),
         'rotors.torque_to_thrust_ratio': RATIO}
     assert set(truth) | {'rotors.time_constant', 'effects.joint_friction.stiction'} \
         == set(robot.intervals)

@@ -67,8 +67,7 @@ def test_stiction_holds_a_joint_exactly_still_and_releases_it_beyond():
 
 def test_a_load_beyond_the_motor_torque_moves_the_joint():
     servo = replace(PLAIN, effort_limit=0.05)
-    assert servo.acceleration(NUMPY, 1.0, 0.0, 0.0, -0.08) == pytest.approx(
-        -0.03 / servo.inertia)
+    assert servo.acceleration(NUMPY, 1.0, 0.0, 0.0, -0.08) == pytest.approx(-0.03 / servo.inertia)
     _, rate = Step(NUMPY, servo, 1e-5)(1.0, 0.0, 0.0, -0.08)
     assert rate == pytest.approx(-0.03 / servo.inertia * 1e-5)
 

@@ -50,6 +50,5 @@ def test_the_plan_of_a_graph_with_another_controller(tmp_path):
 def test_a_component_of_others_is_a_node_with_its_topics(make):
     node = make(maker(OBSERVER))
     assert '/observer/force' in {one.topic_name for one in node.publishers}
-    assert {'/command', '/odom', '/imu/data_raw'} <= {
-        one.topic_name for one in node.subscriptions}
+    assert {'/command', '/odom', '/imu/data_raw'} <= {one.topic_name for one in node.subscriptions}
     assert node.get_name() == node.component.name == 'wrench_observer_node'

@@ -29,8 +29,7 @@ from beetle_omni_ros.ros import fly as fly_module
 from beetle_omni_ros.ros.graph import Graph, in_simulated_time
 
 OBSERVER = f'{Path(__file__).parents[2]}/examples/own_component.py:WrenchObserver'
-NODES = ('recorder_node', 'sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node',
-         'reference_node')
+NODES = ('recorder_node', 'sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node', 'reference_node')
 
 
 def test_switches_and_the_loss_of_recorder_reference_controller_and_estimator(ros_domain,

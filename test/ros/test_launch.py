@@ -88,8 +88,7 @@ def test_simulator_and_bridges_meet_at_the_same_ports_in_a_private_folder(bringu
     folder = Path(nodes['sim_node']['servo_port']).parent
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     files = [str(share_path(f'params/{name}.yaml')) for name in ('robot', 'robot_measured')]
-    direct, = given_to(bringup.start(actuators='direct', robot_file=files[0],
-                                     plant_file=files[1]))
+    direct, = given_to(bringup.start(actuators='direct', robot_file=files[0], plant_file=files[1]))
     assert 'actuators' not in direct['sim_node']
     assert [direct[name]['robot_file'] for name in ('ekf_node', 'sim_node')] == files
 

@@ -205,8 +205,7 @@ def test_after_any_events_rotors_turn_only_if_armed_and_by_fresh_targets(events)
         answer = ACTIONS[action](bench)
         bench.wait(pause)
         bench.feed()
-        if action == 'reboot' or action in ('arm', 'disarm') and answer \
-                and answer[0] == ACCEPTED:
+        if action == 'reboot' or action in ('arm', 'disarm') and answer and answer[0] == ACCEPTED:
             disarmed = action != 'arm'
         if action in ('thrust', 'zero', 'clipped', 'ahead'):
             last_target = bench.now - pause

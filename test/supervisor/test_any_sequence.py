@@ -21,8 +21,7 @@ actions = st.lists(st.one_of(
     st.tuples(st.just('command'), st.sampled_from(['nmpc', 'rl']), offsets, fours, fours),
     st.tuples(st.just('spoil'), st.sampled_from(RUBBISH), st.integers(0, 7)),
     st.tuples(st.just('state'), times, fours, fours, fours),
-    st.tuples(st.just('raw'), times, fours, fours),
-    st.tuples(st.just('battery'), numbers),
+    st.tuples(st.just('raw'), times, fours, fours), st.tuples(st.just('battery'), numbers),
     st.tuples(st.just('bridge'), st.sampled_from(['joint', 'rotor']),
               st.sampled_from(['ready', 'waiting: port', 'lost: it', '', 'x'])),
     st.tuples(st.just('toggle'), st.sampled_from(

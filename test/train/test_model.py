@@ -129,8 +129,7 @@ def flown(x, u, duration):
         for _ in range(round(duration / WORLD.tick)):
             made.step()
         q, v = made.state
-        after[k] = np.r_[q[:3] - height, v[:3], q[[4, 5, 6, 3]], v[3:6], q[7:], v[6:],
-                         made.thrust]
+        after[k] = np.r_[q[:3] - height, v[:3], q[[4, 5, 6, 3]], v[3:6], q[7:], v[6:], made.thrust]
     return after
 
 

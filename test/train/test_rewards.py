@@ -71,8 +71,8 @@ def published(m):
         'joint_action_rate': sum((a - b) ** 2 for a, b in zip(q, m['previous_tilt_command'])),
         'thrust_action_rate': sum((a - b) ** 2 for a, b in zip(f, m['previous_thrust_command'])),
         'thrust_power': sum(x ** 2 for x in m['thrust']),
-        'joint_acceleration': sum((a - b) ** 2 for a, b in zip(m['tilt_rate'],
-                                                               m['previous_tilt_rate'])),
+        'joint_acceleration': sum(
+            (a - b) ** 2 for a, b in zip(m['tilt_rate'], m['previous_tilt_rate'])),
         'z_axis_align': np.linalg.norm(m['z_axis'] - m['target_z_axis']) > 1.5,
         'thrust_allocation': sum((x - sum(f) / 4) ** 2 for x in f) * m['z_axis'][2] ** 2,
     }
