@@ -39,9 +39,7 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
             elif spec.of_each:
                 own = number_of(robot, spec.number) if spec.number else spec.neutral
                 value = _of_each(values.get(parameter, own), found)
-            low, high = spec.low, spec.high
-            values[parameter] = [rounded(min(max(v, low), high)) for v in value] \
-                if isinstance(value, (list, tuple)) else rounded(min(max(value, low), high))
+            values[parameter] = rounded(np.clip(value, spec.low, spec.high))
     return effects
 
 
@@ -134,7 +132,7 @@ def write_corrected(path: Path, results: dict, robot: RobotParameters,
                              for key, entry in effect['parameters'].items()}}
              for effect in results['effects']]
     numbers = own_numbers(robot, results.get('tolerances') or {}, effects) if tolerances else {}
-    content = {**_plain(numbers), 'effects': _plain(effects), 'provenance': _plain({
+    content = {**rounded(numbers), 'effects': rounded(effects), 'provenance': rounded({
         'written_by': f'beetle_omni gap {__version__}',
         'date': datetime.now(timezone.utc).strftime('%Y-%m-%d'),
         'runs': results['meta']['runs'], 'holdout': results['meta']['holdout'],
@@ -149,13 +147,3 @@ def _interval(entry):
     """The interval of a fitted parameter; {} for a number that was not fitted."""
     interval = entry.get('interval')
     return {'interval': interval} if interval and np.ptp(interval, axis=-1).any() else {}
-
-
-def _plain(value):
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return rounded(value)
-    return value
