@@ -57,17 +57,15 @@ def summary(result: dict) -> str:
     if verdict == 'not_decidable':
         return f'These data cannot decide: {reason}.'
     if verdict == 'unknown':
-        return ' '.join(filter(None, [f'No known effect explains the disagreement: {reason}.',
-                                      _partly(result), _chance(result)]))
+        partial = [' or '.join(effect['names']) for effect in result['partial']]
+        return ' '.join(filter(None, [
+            f'No known effect explains the disagreement: {reason}.',
+            f'{_capital(listed(partial))} would explain a part.' if partial else '',
+            _chance(result)]))
     further = len(result['bad_data']) - 1
     return (reason if reason.endswith('?') else f'{reason}.') + (
         f' {further} more {"fault is" if further == 1 else "faults are"} listed below.'
         if further > 0 else '')
-
-
-def _partly(result):
-    partial = [' or '.join(effect['names']) for effect in result['partial']]
-    return f'{_capital(listed(partial))} would explain a part.' if partial else ''
 
 
 def listed(words: list[str], last: str = 'and') -> str:
