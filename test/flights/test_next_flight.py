@@ -12,10 +12,10 @@ from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.experiment import Experiments
 from beetle_omni_ros.identify.flights import next_flight
 from beetle_omni_ros.identify.flights.evidence import Judge, log_prior, normal
-from beetle_omni_ros.identify.flights.flat import flat_flight
 from beetle_omni_ros.identify.flights.keys import Entry
 from beetle_omni_ros.identify.flights.next_flight import (
     Explanation,
+    flat_flight,
     Outlook,
     Planner,
     posterior_of,

@@ -258,15 +258,11 @@ class BagFlight:
             slopes[:, PLACE['J'], names.index(name)] = slope
         late = sorted(LATE_TILTS & set(names))
         if self.signals.model_tilts is not None and late:
-            slopes[:, PLACE['B'], [names.index(name) for name in late]] += \
-                self._of_late_tilts(theta, now['B'])[:, :, None]
+            h = self.keys[TILT_BUS].step
+            run, = self._servos([{**theta, TILT_BUS: theta.get(TILT_BUS, 0.0) + h}], theta)
+            moved = self._with_tilts(self.signals.model_tilts, run, theta, 'B')['B'] - now['B']
+            slopes[:, PLACE['B'], [names.index(name) for name in late]] += moved[:, :, None] / h
         return slopes
-
-    def _of_late_tilts(self, theta, now):
-        """Derivative (M, 6) of forces and torques by the delay of the tilts of a servo model."""
-        h = self.keys[TILT_BUS].step
-        run, = self._servos([{**theta, TILT_BUS: theta.get(TILT_BUS, 0.0) + h}], theta)
-        return (self._with_tilts(self.signals.model_tilts, run, theta, 'B')['B'] - now) / h
 
     def _of_pose_shift(self, theta):
         """

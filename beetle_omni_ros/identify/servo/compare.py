@@ -121,7 +121,13 @@ def gap_of(search: Search, apart: Search, robot: RobotParameters, **more) -> dic
     return result_of(
         verdict, {}, reason, closure=closure, gap_before=ratio['before'],
         gap_after=ratio['after'], noise_floor=1.0, effects=effects if explained else [],
-        partial=[] if explained else effects, candidates=_candidates(search), held_out=True,
+        partial=[] if explained else effects, held_out=True, candidates=[
+            {'name': name, 'accepted': name in search.chosen.entries,
+             'evidence': _evidence(search, name),
+             'reason': '' if name in search.chosen.entries else
+             'the evidence does not need it' if search.gains[name] < CERTAIN else
+             'less than an encoder count, or no better on left-out blocks'}
+            for name in sorted(search.gains, key=lambda name: -search.gains[name])],
         where=sorted(({'channel': f'joint_{number}', 'regime': 'log',
                        'excess': float(before[u] / floor[u]),
                        'excess_after': float(after[u] / floor[u])}
@@ -136,16 +142,6 @@ def _evidence(search, name):
     held = sign * (on.held - off.held)
     return {'ln_bayes_factor': search.gains[name], 'delta_bic': 2 * search.gains[name],
             'cv_gain': 2 * float(held.sum()), 'blocks_positive': int((held > 0).sum())}
-
-
-def _candidates(search):
-    """One row for each entry with its evidence, largest gain first."""
-    return [{'name': name, 'accepted': name in search.chosen.entries,
-             'evidence': _evidence(search, name),
-             'reason': '' if name in search.chosen.entries else
-             'the evidence does not need it' if search.gains[name] < CERTAIN else
-             'less than an encoder count, or no better on left-out blocks'}
-            for name in sorted(search.gains, key=lambda name: -search.gains[name])]
 
 
 def _effects(search, robot):
