@@ -12,7 +12,7 @@ from beetle_omni_ros.identify.flights.keys import names_of, number_of
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.model.schema import nest, ParameterError
 
 MEMBERS = 4     # length of a list with one value for each rotor or joint
 
@@ -67,22 +67,16 @@ def own_numbers(robot: RobotParameters, tolerances: dict[str, dict],
             found = [tolerances[key]['deviation'] for key in names_of(name, parameter)
                      if key in tolerances]
             if spec.number and found and name not in {*robot.effects, *named}:
-                _put(result, spec.number, number_of(robot, spec.number) * np.exp(
-                    found if len(found) > 1 else found[0]))
+                value = number_of(robot, spec.number) * np.exp(
+                    found if len(found) > 1 else found[0])
+                result[spec.number] = np.asarray(value).tolist()
     moved = [tolerances.get(f'position.offset[{k}]', {'deviation': 0.0})['deviation']
              for k in range(12)]
     if any(moved):
-        _put(result, 'rotors.positions', robot.rotors.positions + np.reshape(moved, (4, 3)))
+        result['rotors.positions'] = (robot.rotors.positions + np.reshape(moved, (4, 3))).tolist()
     if any(moved) or 'mass' in result:      # alone they would move the inertia
         result.setdefault('inertia', robot.inertia.tolist())
-    return result
-
-
-def _put(content, key, value):
-    *parts, last = key.split('.')
-    for part in parts:
-        content = content.setdefault(part, {})
-    content[last] = np.asarray(value).tolist()
+    return nest(result)
 
 
 def _of_each(own, found):
