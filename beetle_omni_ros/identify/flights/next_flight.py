@@ -102,27 +102,21 @@ def posterior_of(engine: Engine, solution: Solution, equations: Normal,
     return covariance @ right, covariance
 
 
-class Gain:
-    """What the measurements of a flight are worth."""
-
-    def __init__(self, engine: Engine, solution: Solution):
-        self._engine = engine
-        self._blocks = sum(len(each.residual) for each in solution.spectra)
-
-    def information(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
-        """(K, K) information of blocks of one flight without what differs between flights."""
-        engine, total = self._engine, np.sum(grams, axis=0)
-        own = np.flatnonzero(engine.flight > 0)
-        inner = np.linalg.inv(total[np.ix_(own, own)] + np.diag(engine.flight[own]**-2))
-        total = total - total[:, own] @ inner @ total[own]
-        return total / few_blocks(engine.alpha / len(engine.entries), self._blocks + len(grams))
+def information(engine: Engine, solution: Solution, grams: Sequence[np.ndarray] | np.ndarray
+                ) -> np.ndarray:
+    """(K, K) information of blocks of one more flight, without what differs between flights."""
+    total, own = np.sum(grams, axis=0), np.flatnonzero(engine.flight > 0)
+    inner = np.linalg.inv(total[np.ix_(own, own)] + np.diag(engine.flight[own]**-2))
+    total = total - total[:, own] @ inner @ total[own]
+    blocks = sum(len(each.residual) for each in solution.spectra) + len(grams)
+    return total / few_blocks(engine.alpha / len(engine.entries), blocks)
 
 
-class Outlook(Gain):
+class Outlook:
     """What a flight is expected to decide between hypotheses."""
 
     def __init__(self, engine: Engine, solution: Solution, hypotheses: Sequence[Explanation]):
-        super().__init__(engine, solution)
+        self._engine, self._solution = engine, solution
         self._hypotheses, self._scale = list(hypotheses), np.hypot(engine.narrow, engine.typical)
         odds = np.array([each.odds for each in hypotheses])
         self.odds, self.weights = odds, np.exp(odds - np.logaddexp.reduce(odds))
@@ -132,7 +126,8 @@ class Outlook(Gain):
     def chances(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """(H, 2) probability that each hypothesis, if true, is decided, and another one is."""
         s, rng = self._scale, np.random.default_rng(0)
-        values, vectors = np.linalg.eigh(s[:, None] * self.information(grams) * s)
+        values, vectors = np.linalg.eigh(
+            s[:, None] * information(self._engine, self._solution, grams) * s)
         keep = values > FAINT
         root = np.sqrt(values[keep]) * vectors[:, keep] / s[:, None]
         # mean (r,) and covariance (r, r) of the measurements under each hypothesis
@@ -150,11 +145,11 @@ class Outlook(Gain):
         return np.array(found)
 
 
-class Sight(Gain):
+class Sight:
     """What a flight is expected to show of single effects of typical size, if one is there."""
 
     def __init__(self, engine: Engine, solution: Solution, names: Sequence[str]):
-        super().__init__(engine, solution)
+        self._engine, self._solution = engine, solution
         self._info = normal(solution.spectra, engine.names, engine.flight).info
         count = len(engine.entries)
         self._least = log(1 / engine.alpha) + log_prior(0, count) - log_prior(1, count)
@@ -170,9 +165,9 @@ class Sight(Gain):
     def chances(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """(H, 2) probability that each effect is named if it is there, and 0."""
         narrow = self._engine.narrow
+        info = self._info + information(self._engine, self._solution, grams)
         covariance = narrow[:, None] * np.linalg.inv(
-            narrow[:, None] * (self._info + self.information(grams)) * narrow
-            + np.eye(len(narrow))) * narrow
+            narrow[:, None] * info * narrow + np.eye(len(narrow))) * narrow
         # of an effect with several entries, that of the clearest one
         return np.array([[max(self._chance(covariance, c) for c in entries), 0.0]
                          for entries in self._keys.values()])
