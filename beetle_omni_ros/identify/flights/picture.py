@@ -41,6 +41,8 @@ def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str
     candidates, sections = result['candidates'], []
     if candidates:
         least = log(1 / result['meta']['alpha'])
+        tolerances = [[name, f'{100 * e["deviation"]:.2f} %' if e['relative'] else
+                       f'{e["deviation"]:.2g}'] for name, e in result['tolerances'].items()]
         sections = [
             section('Evidence', 'Every entry of the catalogue that these flights were compared '
                     'with. An effect is named if its evidence outweighs the number of entries '
@@ -52,7 +54,7 @@ def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str
             section('Tolerances', 'Deviations of this robot from the robot file, as fitted and '
                     'not named; --tolerances writes masses, gains, lags and rotor positions to '
                     'the robot file.', '<details><summary>All numbers</summary>'
-                    f'{html(_tolerances(result))}</details>')]
+                    f'{html(Grid("", ["number", "deviation"], tolerances))}</details>')]
     with matplotlib.rc_context(figures.STYLE):
         picture = figures.svg(_damage(*damaged), 'damaged readings') if damaged else figures.svg(
             picture_of(result), 'disagreement and sizes') if result['where'] else ''
@@ -107,12 +109,6 @@ def _sizes(effects):
                 result.append((f'{text}\n{name}{more}', *(
                     (x - own) / found['typical'] for x in (value, *span))))
     return result
-
-
-def _tolerances(result):
-    rows = [[name, f'{100 * e["deviation"]:.2f} %' if e['relative'] else f'{e["deviation"]:.2g}']
-            for name, e in result['tolerances'].items()]
-    return Grid('', ['number', 'deviation'], rows)
 
 
 def _damage(recording, damage):
