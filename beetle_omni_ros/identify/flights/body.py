@@ -129,9 +129,3 @@ def tilting_modules(robot: RobotParameters) -> tuple[float, float]:
     module = robot.multibody.module
     depth = -float(module.centre_of_mass[2])
     return float(module.inertia[0] + module.mass * depth**2), float(module.mass * depth)
-
-
-def swing_of(robot: RobotParameters) -> float:
-    """Logarithm of the ratio of a module's inertia about its joint and the servo's inertia."""
-    inertia = tilting_modules(robot)[0]
-    return float(np.log(max(inertia / robot.joints.inertia, 1.0))) if inertia else 0.0
