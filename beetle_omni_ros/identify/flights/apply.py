@@ -121,8 +121,8 @@ def write_corrected(path: Path, results: dict, robot: RobotParameters,
         raise ParameterError(f'{path}: the corrected robot is not possible: {error}') from None
     named = [{'names': effect['names'],
               **{key: effect[key] for key in ('rotor', 'joint') if key in effect},
-              'parameters': {key: {name: entry[name] for name in ('value', 'interval', 'unit')
-                                   if entry.get(name) is not None}
+              'parameters': {key: {'value': entry['value'], **_interval(entry),
+                                   'unit': entry['unit']}
                              for key, entry in effect['parameters'].items()}}
              for effect in results['effects']]
     numbers = own_numbers(robot, results.get('tolerances') or {}, effects) if tolerances else {}
@@ -135,3 +135,9 @@ def write_corrected(path: Path, results: dict, robot: RobotParameters,
     head = ('# Robot file with the effects that `beetle_omni gap` named. SI units; see\n'
             '# docs/gap.md. Removing an entry below `effects` undoes it.\n')
     write_robot_file(path, head, content, base)
+
+
+def _interval(entry):
+    """The interval of a fitted parameter; {} for a number that was not fitted."""
+    interval = entry.get('interval')
+    return {'interval': interval} if interval and np.ptp(interval, axis=-1).any() else {}
