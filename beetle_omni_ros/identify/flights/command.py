@@ -98,9 +98,10 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
                     if form else _bags(runs, holdout, robot, p, fix, alpha, status.update, then)
             result = results(model, then)
             result = learned(results, model, result) if learn else result
-        result['meta'] |= {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
-                           'robot': str(robot) if robot else 'params/robot.yaml', 'alpha': alpha}
+        result['meta']['alpha'] = alpha
         made_page = partial(_page, result, [*runs, *holdout])
+    result['meta'] |= {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
+                       'robot': str(robot) if robot else 'params/robot.yaml'}
     write_json(json_path, result)
     if page:
         write_text(page, made_page(), 'page')
