@@ -45,13 +45,14 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
 
     Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
     """
-    from beetle_omni_ros.identify.flights.command import run_gap
+    from beetle_omni_ros.identify.flights.command import gap_results
     experiments = None
     if next_task:
         from beetle_omni_ros.flight.experiment import Experiments as experiments
-    return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
-                   tolerances=tolerances, form=form, alpha=alpha, next_task=next_task, learn=learn,
-                   experiments=experiments)
+    return _status(gap_results(
+        runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
+        tolerances=tolerances, form=form, alpha=alpha, next_task=next_task, learn=learn,
+        experiments=experiments))
 
 
 def improve(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
@@ -108,7 +109,12 @@ def improve(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
     write_json(output / 'improve.json', results)
     shown = output / ('improve.html' if found['effects'] else 'gap.html')
     page.print_end(console, [shown, output / 'improve.json'], f'open {shown} in a browser')
-    return 3 if found['verdict'] == 'bad_data' else 0
+    return _status(found)
+
+
+def _status(results):
+    """Exit status by the verdict."""
+    return 3 if results['verdict'] == 'bad_data' else 0
 
 
 identify = options.Commands(help='Fit the actuator models from measured data.')
@@ -153,7 +159,7 @@ def rotor(paths: Annotated[list[Path], Argument(metavar='LOG.csv...', help=(
 
     Example: beetle_omni identify rotor bench.csv --params my_robot.yaml --report rotor.html
     """
-    return 3 if _run('rotor', **locals())['verdict'] == 'bad_data' else 0
+    return _status(_run('rotor', **locals()))
 
 
 @identify.command()

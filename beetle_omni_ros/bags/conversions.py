@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 import json
 from math import floor, isfinite
 from operator import attrgetter
@@ -47,16 +46,15 @@ Form = tuple[str, type, Callable[[Any], Any], Callable[[Any], Any], Callable[[An
 def form(name: str, value: type, read: Callable[[Any], Any], write: Callable[[Any], Any],
          finite: Sequence[str] = ()) -> Form:
     """Return a form whose ``finite`` attributes are checked in flight; a quaternion is unit."""
-    return name, value, read, write, partial(_checked, read, finite)
+    def take(message):
+        found = read(message)
+        for part in finite:
+            check_finite(getattr(found, part), part)
+        if 'quaternion' in finite:
+            unit(found.quaternion)
+        return found
 
-
-def _checked(read, names, message):
-    value = read(message)
-    for name in names:
-        check_finite(getattr(value, name), name)
-    if 'quaternion' in names:
-        unit(value.quaternion)
-    return value
+    return name, value, read, write, take
 
 
 # --- times, vectors, checks ---------------------------------------------------------------------

@@ -315,19 +315,17 @@ class Arming:
             return f'lost: {self._lost}'
         if self.phase == FLIES and self._silent:
             return f'silent: {self._silent}'
-        missing = self._missing if self.phase == RESTS else ''
-        return f'waiting: {missing}' if missing else 'ready'
-
-    @property
-    def _missing(self):
-        """Reason on either side that prevents arming now; '' if there is none."""
+        if self.phase != RESTS:
+            return 'ready'
+        # What prevents arming now, on either side.
         missing = self._inhibited or self._board.ready
         if not missing and self._disarm:
             missing = 'disarming is not confirmed yet'
-        if not missing:
-            missing = ', '.join(text for text in self._board.state.status.conditions
-                                if text in mavlink.BLOCKS_ARMING)
-        return missing or ('' if self._supervisor else 'no message from the supervisor')
+        missing = missing or ', '.join(text for text in self._board.state.status.conditions
+                                       if text in mavlink.BLOCKS_ARMING)
+        if not (missing or self._supervisor):
+            missing = 'no message from the supervisor'
+        return f'waiting: {missing}' if missing else 'ready'
 
     def _check_answer(self):
         command, status = self._command, self._board.state.status

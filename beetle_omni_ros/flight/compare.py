@@ -15,7 +15,7 @@ import numpy as np
 from rich.console import Console
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.bags.log import errors, FlightLog, motion
+from beetle_omni_ros.bags.log import FlightLog, target_errors
 from beetle_omni_ros.bags.metrics import metrics
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
@@ -148,23 +148,16 @@ def trace(log: FlightLog, task: Task) -> dict[str, np.ndarray]:
 
     Returns:
         t (N,) since the first target [s], position_error (N,) [m] and orientation_error (N,)
-        [deg], NaN without a target.
+        [deg].
 
     """
     if not log.targets:
         return {}
-    body, start = motion(log), log.targets[0].stamp
-    end = min(body.t[-1], start + task.duration)
-    index = np.unique(np.searchsorted(body.t, np.arange(start, end, TRACE_PERIOD)))
-    index = index[index < len(body.t)]
-    apart = np.full((2, len(body.t)), np.nan)
-    for target, until in zip(log.targets, [*(t.stamp for t in log.targets[1:]), np.inf],
-                             strict=True):
-        window = body.window(target.stamp, min(until, end))
-        apart[:, window] = errors(body, target, window)
-    kept = {'t': body.t[index] - start, 'position_error': apart[0, index],
-            'orientation_error': apart[1, index]}
-    return {name: values.astype(np.float32) for name, values in kept.items()}
+    start, (t, *apart) = log.targets[0].stamp, target_errors(log)
+    until = min(t[-1], start + task.duration)
+    index = np.unique(np.searchsorted(t, np.arange(start, until, TRACE_PERIOD)))
+    return {name: values[index].astype(np.float32) for name, values in zip(
+        ('t', 'position_error', 'orientation_error'), (t - start, *apart), strict=True)}
 
 
 # --- command -------------------------------------------------------------------------------------

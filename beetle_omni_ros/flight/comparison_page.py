@@ -30,15 +30,6 @@ SHOWN = {'position': 2.0, 'orientation': 180.0}  # largest limit of a disturbanc
 Groups = dict[str, list[dict]]      # controller -> one result with a trace for each seed
 
 
-def results_with_trace(flown: dict, task: str, conditions: str) -> Groups:
-    """Results with a trace of a task under one set of conditions."""
-    chosen: Groups = {}
-    for flight, result in flown.items():
-        if (flight.task, flight.conditions) == (task, conditions) and result['trace']:
-            chosen.setdefault(flight.controller, []).append(result)
-    return chosen
-
-
 def convergence(groups: Groups, task: str) -> Figure:
     """Errors in the 8 s of a pose: median and 10 to 90 % band over all poses."""
     figure, axes = panels(1, 2, height=2.8)
@@ -251,7 +242,10 @@ def sections(results: dict, flown: dict) -> list[dict]:
             blocks: list[Grid | dict] = []
             for conditions in by_conditions:
                 blocks.append(table(results, task, conditions))
-                groups = results_with_trace(flown, task, conditions)
+                groups: Groups = {}
+                for flight, result in flown.items():
+                    if (flight.task, flight.conditions) == (task, conditions) and result['trace']:
+                        groups.setdefault(flight.controller, []).append(result)
                 for name, caption, draw in DRAWN.get(summary.kind_of(task), ()):
                     if groups and (figure := draw(groups, task)):
                         data = png(figure)

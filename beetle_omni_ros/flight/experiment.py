@@ -8,7 +8,7 @@ from rich.console import Console
 
 from beetle_omni_ros.bags.log import FlightLog
 from beetle_omni_ros.bags.metrics import metrics
-from beetle_omni_ros.bags.task_metrics import U_WINDOW
+from beetle_omni_ros.bags.task_metrics import reduced, U_WINDOW
 from beetle_omni_ros.control.tasks import POSE_DURATION, poses_task, random_poses, Task
 from beetle_omni_ros.flight.campaign import Store, sweep
 from beetle_omni_ros.flight.compare import ComparedFlight, fly_flight
@@ -144,7 +144,8 @@ def before_and_after(robot: Path | None, corrected: Path, plant: Path | None,
 def compared(poses: dict[str, list[dict]]) -> dict:
     """Summary of the poses flown with each of ``FILES``; see :func:`before_and_after`."""
     made: dict = {file: {'reached': sum(pose['reached'] for pose in flown), 'poses': len(flown),
-                         **{key: mean([pose[key] for pose in flown]) for key in ERRORS}}
+                         **{key: reduced(np.mean, [pose[key] for pose in flown])
+                            for key in ERRORS}}
                   for file, flown in poses.items()}
     before, after = (made[file] for file in FILES)
     made['ratio'] = {key: after[key] / before[key] if before[key] and after[key] else None
@@ -163,12 +164,6 @@ def is_worse(before: list[float | None], after: list[float | None]) -> bool:
     more = pairs[:, 1] - (1 + WORSE) * pairs[:, 0]
     spread = more.std(ddof=1) if len(more) > 1 else 0.0
     return bool(more.mean() > CERTAIN * spread / np.sqrt(len(more)))
-
-
-def mean(values: list[float | None]) -> float | None:
-    """Mean of the poses that were flown; None without any."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
 
 
 def improvement_grid(results: dict, title: str) -> Grid:

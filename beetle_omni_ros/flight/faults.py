@@ -117,12 +117,6 @@ def total_text(results: dict) -> str:
             f"a crash, {total['takeoffs']} take-offs without arming, {total['errors']} errors.")
 
 
-def as_markdown(results: dict) -> str:
-    """All results as Markdown."""
-    return (f"# Faults\n\n{results['meta']['command']}\n\n{total_text(results)}\n\n"
-            + page.markdown(grid(results)))
-
-
 def as_page(results: dict, folder: Path | None = None) -> str:
     """All results as one HTML page; ``folder`` is its folder, which contains recorded bags."""
     meta, total, flights = results['meta'], results['summary']['total'], results['flights']
@@ -210,7 +204,8 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     if output:
         write_json(output / 'faults.json', results)
         write_text(output / PAGE, as_page(results, output), 'page')
-        write_text(output / 'faults.md', as_markdown(results), 'page')
+        write_text(output / 'faults.md', f"# Faults\n\n{results['meta']['command']}\n\n"
+                   f'{total_text(results)}\n\n{page.markdown(grid(results))}', 'page')
     page.print_grids([grid(results, narrow=True)], console)
     console.print(total_text(results), highlight=False, markup=False, soft_wrap=True)
     page.print_end(console, [output and output / PAGE, json_path],

@@ -11,6 +11,7 @@ import hashlib
 from pathlib import Path
 import re
 import shlex
+import sys
 
 import numpy as np
 from rich.console import Console
@@ -95,8 +96,7 @@ def run_identify(what: str, paths: Sequence[Path], *, validate: Sequence[Path] =
         texts += [] if whole else [f'verdict: {results["rotor"]["verdict"]}', *(
             f'warning: {warning}' for warning in results['rotor']['warnings'])]
     if params:
-        results['robot'] = write_measured(params, parameters, robot, _line(
-            what, paths, robot, params, rate, columns), paths, servo, rotor)
+        results['robot'] = write_measured(params, parameters, robot, paths, servo, rotor)
     if whole and joints:
         tables.append(of_joints.flown_errors(joints, {
             robot.stem if robot else 'published': parameters,
@@ -117,14 +117,6 @@ def run_identify(what: str, paths: Sequence[Path], *, validate: Sequence[Path] =
               *([f'open {report} in a browser'] if report else []), ('evaluate', '--plant', params)
               if params else 'the same with --params FILE writes a robot file')
     return results
-
-
-def _line(what, paths, robot, params, rate, columns):
-    """The command, for the written file."""
-    options = (('--rate', f'{rate:g}' if rate else None), ('--robot', robot), ('--params', params))
-    return shlex.join(map(str, (
-        'beetle_omni', 'identify', what, *paths, *(x for c in columns for x in ('--column', c)),
-        *(x for name, value in options if value for x in (name, value)))))
 
 
 def read_logs(what: str, paths: Sequence[Path], columns: Mapping[str, tuple[str, float]],
@@ -210,15 +202,15 @@ def servo_values(search: Search, robot: RobotParameters) -> tuple[dict, dict, di
             low = np.minimum(np.min(ends, axis=0)[0], value)
             high = np.maximum(np.max(ends, axis=0)[1], value)
             key = f'effects.{entry}.{name}'
-            effects[entry][name] = _plain(value)
-            intervals[key] = [_plain(low), _plain(high)]
+            effects[entry][name] = rounded(value, 4)
+            intervals[key] = rounded([low, high], 4)
             origin[key] = how
     if effects.keys() >= {'joint_bandwidth', 'joint_command_latency'}:
         lags = [other['joint_bandwidth']['kd'] / other['joint_bandwidth']['kp']
                 + other['joint_command_latency']['delay'] for other in (best, *others)]
         low, *_, high = np.percentile(np.concatenate(lags[1:], axis=1), TAILS, axis=1)
         low, high = np.minimum(low, lags[0][:, 0]), np.maximum(high, lags[0][:, 0])
-        intervals[TILT_LAG] = [_plain(low), _plain(high)]
+        intervals[TILT_LAG] = rounded([low, high], 4)
         origin[TILT_LAG] = how | {'how': 'Kd / Kp plus delay [s]; the logs determine the sum '
                                          'better than its parts'}
     if 'joint_offset' in search.chosen.entries:
@@ -268,11 +260,6 @@ def _entries(search: Search, trial: ServoModel, log: int | None, robot: RobotPar
     return result
 
 
-def _plain(values):
-    values = [rounded(value, 4) for value in np.atleast_1d(values)]
-    return values if len(values) > 1 else values[0]
-
-
 def rotor_values(results: dict) -> tuple[dict, dict, dict]:
     """
     Keys of ``rotors`` from the results of a rotor identification.
@@ -291,7 +278,7 @@ def rotor_values(results: dict) -> tuple[dict, dict, dict]:
             {'voltage': round(p['voltage_V'], 3), 'thrust_max': round(p['thrust_max_N'], 4),
              'coefficients': [round(p['coefficients'][f'c{k}']['value'], 8) for k in range(4)]}
             for p in rows]}
-        intervals['rotors.torque_to_thrust_ratio'] = [rounded(e, 4) for e in ratio['interval']]
+        intervals['rotors.torque_to_thrust_ratio'] = rounded(ratio['interval'], 4)
         band = max(p['thrust_half_width_N'] for p in rows)
         origin['rotors.torque_to_thrust_ratio'] = {
             'logs': logs, 'how': 'slope of torque over thrust of settled steps'}
@@ -303,7 +290,7 @@ def rotor_values(results: dict) -> tuple[dict, dict, dict]:
         shown = [one for one in lag['logs'] if 'value' in one]
         low, high = zip(*(one['interval'] for one in shown), strict=True)
         rotors['time_constant'] = rounded(lag['value'], 4)
-        intervals['rotors.time_constant'] = [rounded(min(low), 4), rounded(max(high), 4)]
+        intervals['rotors.time_constant'] = rounded([min(low), max(high)], 4)
         origin['rotors.time_constant'] = {'logs': [one['log'] for one in shown], 'how': (
             f'both directions of {lag["log"]}'
             + ' with a gain for each window, as thrust and command do not belong together' * bool(
@@ -311,7 +298,7 @@ def rotor_values(results: dict) -> tuple[dict, dict, dict]:
     return rotors, intervals, origin
 
 
-def write_measured(path: Path, robot: RobotParameters, base: Path | None, command: str,
+def write_measured(path: Path, robot: RobotParameters, base: Path | None,
                    logs: Sequence[Path], servo: tuple | None, rotor: tuple | None) -> dict:
     """
     Write a robot file that extends ``base`` by measured values.
@@ -320,7 +307,6 @@ def write_measured(path: Path, robot: RobotParameters, base: Path | None, comman
         path: output file.
         robot: robot of ``base``.
         base: extended file; None: the shipped one.
-        command: command line, for ``provenance``.
         logs: files of the logs.
         servo: of :func:`servo_values`.
         rotor: of :func:`rotor_values`.
@@ -344,7 +330,7 @@ def write_measured(path: Path, robot: RobotParameters, base: Path | None, comman
         **({'rotors': rotors} if rotors else {}), **({'effects': merged} if effects else {}),
         'intervals': intervals,
         'provenance': {
-            'command': command, 'version': __version__,
+            'command': shlex.join(['beetle_omni', *sys.argv[1:]]), 'version': __version__,
             'logs': {log.name: {'sha256': hashlib.sha256(log.read_bytes()).hexdigest()}
                      for log in logs if log.is_file()},
             'origin': origin,

@@ -1,7 +1,9 @@
 """Robot files that extend another one."""
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import yaml
 
 from beetle_omni_ros.model.files import write_text
@@ -53,6 +55,12 @@ def write_robot_file(path: Path, head: str, content: dict, base: Path | None) ->
     write_text(path, head + text, 'parameter file')
 
 
-def rounded(value: float, digits: int = 5) -> float:
-    """``value`` with so many significant digits."""
-    return float(f'{value:.{digits}g}')
+def rounded(value: Any, digits: int = 5) -> Any:
+    """``value`` with so many significant digits: a number, or those of mappings and sequences."""
+    if isinstance(value, dict):
+        return {key: rounded(item, digits) for key, item in value.items()}
+    if isinstance(value, np.ndarray):       # with one number: this number
+        return rounded(value.squeeze().tolist(), digits)
+    if isinstance(value, (list, tuple)):
+        return [rounded(item, digits) for item in value]
+    return float(f'{value:.{digits}g}') if isinstance(value, float) else value

@@ -169,6 +169,11 @@ class RobotParameters:
         yaw = self.rotors.arm_yaw
         return np.stack([np.cos(yaw), np.sin(yaw), np.zeros(4)], axis=1)
 
+    def thrust_directions(self, tilt: np.ndarray) -> np.ndarray:
+        """(..., 4, 3) unit vectors of the thrusts in base_link at tilts (..., 4) [rad]."""
+        level = np.cross(self.tilt_axes, [0.0, 0.0, 1.0])
+        return np.sin(tilt)[..., None] * level + np.cos(tilt)[..., None] * [0.0, 0.0, 1.0]
+
     @property
     def command_delays(self) -> tuple[float, float]:
         """Delays of tilt and of thrust commands [s] by the effects."""

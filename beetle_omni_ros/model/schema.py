@@ -253,9 +253,14 @@ def nest(flat: dict[str, Any]) -> dict:
     """Turn dotted names into the nested mapping that :func:`bind` takes."""
     nested: dict = {}
     for name, value in flat.items():
-        *path, leaf = name.split('.')
-        level = nested
-        for part in path:
-            level = level.setdefault(part, {})
-        level[leaf] = value
+        put(nested, name, value)
     return nested
+
+
+def put(mapping: dict, name: str, value: Any) -> None:
+    """Set the value of a dotted name; a part that is no mapping is passed over."""
+    *path, leaf = name.split('.')
+    for part in path:
+        level = mapping.setdefault(part, {})
+        mapping = level if isinstance(level, dict) else mapping
+    mapping[leaf] = value

@@ -1,6 +1,6 @@
 """ROS clients: the operator of a graph, and listeners, `check` and the live graph of `view`."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 import math
@@ -149,16 +149,11 @@ class Operator(Client):
         return '; '.join(f'{name} {text}' for name, text in states.items()
                          if not text.startswith(READY))
 
-    def countdown(self, seconds: float) -> Iterator[float]:
-        """Yield the remaining time [s], steady or simulated, until it is over."""
-        start, steady = self.time(), time.monotonic()
-        while (left := start + seconds - self.time()) > 0 \
-                and time.monotonic() - steady < SLOWEST * seconds + 1.0:
-            yield left
-
     def wait(self, condition, timeout: float) -> bool:
         """Process messages until ``condition()`` holds; False after ``timeout`` [s]."""
-        for _ in self.countdown(timeout):
+        start, steady = self.time(), time.monotonic()
+        while self.time() < start + timeout \
+                and time.monotonic() - steady < SLOWEST * timeout + 1.0:
             if condition():
                 return True
             self.spin(0.05)

@@ -85,9 +85,14 @@ def reserved_domain():
         holder = claim(f'domain/{number}')
         if holder is not None:
             with holder:
-                if _ports_are_free(number):
-                    yield number
-                    return
+                try:
+                    for offset in (0, USER_UNICAST):
+                        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                            probe.bind(('', PORT_BASE + DOMAIN_GAIN * number + offset))
+                except OSError:     # another program has a port of this domain
+                    continue
+                yield number
+                return
     raise RunError('no free ROS domain between 1 and 101')
 
 
@@ -96,16 +101,6 @@ def domains_in_use() -> list[int]:
     claims = Path('/proc/net/unix').read_text()     # of FlightNode
     return sorted(set(map(int, re.findall(
         r'@beetle_omni/(\d+)/\S*\b(?:ekf|sim)_node$', claims, re.MULTILINE))))
-
-
-def _ports_are_free(domain):
-    for offset in (0, USER_UNICAST):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(('', PORT_BASE + DOMAIN_GAIN * domain + offset))
-            except OSError:
-                return False
-    return True
 
 
 # --- nodes ------------------------------------------------------------------------------------

@@ -209,7 +209,7 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
     start_from = overrides.get(file_key) or (share_path(file) if file else None)
     mapping = schema.load_yaml(start_from) if start_from else {}
     for name, value in overrides.items():
-        _put(mapping, name, value)
+        schema.put(mapping, name, value)
     instance = schema.bind(cls, mapping)
     for name, entry, hint, value in schema.flatten(instance):
         if isinstance(value, (dict, tuple)) and hint != NAMES:
@@ -219,14 +219,6 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
     if on_change:
         _validate_changes(node, cls, instance, on_change)
     return instance
-
-
-def _put(mapping, name, value):
-    *path, leaf = name.split('.')
-    for part in path:
-        level = mapping.setdefault(part, {})
-        mapping = level if isinstance(level, dict) else mapping
-    mapping[leaf] = value
 
 
 def _plain(value):

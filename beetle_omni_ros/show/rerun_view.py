@@ -6,7 +6,7 @@ from pathlib import Path
 import tempfile
 
 from beetle_omni_ros.bags.bag import read_flights
-from beetle_omni_ros.bags.log import errors, FlightLog, motion
+from beetle_omni_ros.bags.log import FlightLog, target_errors
 from beetle_omni_ros.model.resources import PACKAGE, share_path
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.show.figures import COLOURS
@@ -45,17 +45,16 @@ def send(log: FlightLog, recording) -> None:
     for file in sorted(Path(log.source).glob('*.mcap')) or [Path(log.source)]:
         recording.log_file_from_path(file)
     recording.log(TARGET, rerun.CoordinateFrame(TARGET), rerun.TransformAxes3D(AXES), static=True)
-    body = motion(log)
-    for target, after in zip(log.targets, [*log.targets[1:], None]):
-        window = body.window(target.stamp, (after.stamp if after else log.end) - 1e-3)
-        times = rerun.TimeColumn(TIMELINE, timestamp=body.t[window])
+    t, *away = target_errors(log)
+    for name, values in zip(ERRORS, away, strict=True):
+        recording.send_columns(name, [rerun.TimeColumn(TIMELINE, timestamp=t)],
+                               rerun.Scalars.columns(scalars=values))
+    for target in log.targets:
         reference = target.at(target.stamp)
         recording.set_time(TIMELINE, timestamp=target.stamp)
         recording.log(TARGET, rerun.Transform3D(
             translation=reference.position, quaternion=reference.quaternion,
             parent_frame=WORLD, child_frame=TARGET))
-        for name, values in zip(ERRORS, errors(body, target, window), strict=True):
-            recording.send_columns(name, [times], rerun.Scalars.columns(scalars=values))
     recording.flush()
 
 

@@ -12,10 +12,11 @@ from beetle_omni_ros.control.tasks import make_task
 from beetle_omni_ros.flight.experiment import Experiments
 from beetle_omni_ros.identify.flights import next_flight
 from beetle_omni_ros.identify.flights.evidence import Judge, log_prior, normal
-from beetle_omni_ros.identify.flights.flat import flat_flight
 from beetle_omni_ros.identify.flights.keys import Entry
 from beetle_omni_ros.identify.flights.next_flight import (
     Explanation,
+    flat_flight,
+    information,
     Outlook,
     Planner,
     posterior_of,
@@ -148,10 +149,11 @@ def test_an_effect_is_named_with_the_probability_that_its_evidence_suffices():
         names=names, narrow=np.array([0.01, 1e-6]), typical=np.array([0.3, 0.3]), alpha=0.05,
         flight=np.zeros(2), entries=[Entry(name, (name,)) for name in names],
         indices=lambda chosen: list(chosen))
-    sight = Sight(engine, SimpleNamespace(spectra=[found]), ['one', 'of a balance'])
+    solution = SimpleNamespace(spectra=[found])
+    sight = Sight(engine, solution, ['one', 'of a balance'])
     assert sight.labels == ['one']
     more = [gram([30.0, 0.0])]
-    info = found.grams()[0].sum(axis=(0, 1))[0, 0] + sight.information(more)[0, 0]
+    info = found.grams()[0].sum(axis=(0, 1))[0, 0] + information(engine, solution, more)[0, 0]
     null = 1 / info + 0.01**2
     wide = null + 0.3**2
     # ln B > least for an estimate beyond a limit

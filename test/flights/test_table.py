@@ -65,12 +65,12 @@ def test_the_elements_of_lists_in_a_cell_are_columns(tmp_path):
 
 @pytest.mark.parametrize('text, message', [
     ('duty: {columns: [a, b, c, d]}', "'time' is missing"),
-    ('time: {columns: [t], unit: h}', "'unit': expected one of s, ms, us, ns, found 'h'"),
+    ('time: {columns: [t], unit: h}', "time.unit': expected one of s, ms, us, ns, found 'h'"),
     ('time: {columns: [t], unit: s}\nposition: {columns: [x, y], unit: m}',
-     "'columns': expected 3 names"),
+     "position.columns': expected 3 names"),
     ('time: {columns: [t], unit: s}\nspeed: {columns: [x]}', 'unknown signal'),
     ('time: {columns: [t], unit: s}\nquaternion: {columns: [a, b, c, d], order: zyxw}',
-     "'order': expected one of xyzw, wxyz"),
+     "quaternion.order': expected one of xyzw, wxyz"),
 ])
 def test_a_wrong_format_is_refused_with_file_and_key(tmp_path, text, message):
     with pytest.raises(ParameterError, match='own.yaml') as error:

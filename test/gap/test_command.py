@@ -18,7 +18,7 @@ from beetle_omni_ros import cli
 from beetle_omni_ros.bags.bag import read_messages
 from beetle_omni_ros.bags.bag_writer import BagWriter
 from beetle_omni_ros.identify.flights import command
-from beetle_omni_ros.identify.flights.command import gap_results, run_gap
+from beetle_omni_ros.identify.flights.command import gap_results
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
@@ -122,19 +122,19 @@ def test_a_part_of_a_fitted_flight_is_refused_as_held_out_flight(tmp_path, capsy
     assert 'the same flight in two recordings' in capsys.readouterr().err
 
 
-def test_a_damaged_held_out_flight_gives_bad_data(tmp_path):
+def test_a_damaged_held_out_flight_gives_bad_data(tmp_path, capsys):
     damaged = copied('windy_1', tmp_path / 'damaged',
                      lambda message: not message.topic.endswith('imu/data_raw'))
-    console = quiet()
-    status = run_gap([flight('windy_0')], [damaged], json_path=tmp_path / 'gap.json',
-                     page=tmp_path / 'gap.html', console=console)
+    assert cli.main([str(a) for a in (
+        'gap', flight('windy_0'), '--holdout', damaged, '--json', tmp_path / 'gap.json',
+        '--report', tmp_path / 'gap.html')]) == 3
     results = json.loads((tmp_path / 'gap.json').read_text())
-    assert status == 3 and results['verdict'] == 'bad_data'
+    assert results['verdict'] == 'bad_data'
     assert results['effects'] == [] and results['closure'] is None
     row, = results['bad_data']
     assert (row['run'], row['topic']) == ('damaged', 'imu/data_raw')
     assert 'damaged' in results['summary']
-    assert console.file.getvalue().count(results['summary']) == 1
+    assert ' '.join(capsys.readouterr().out.split()).count(results['summary']) == 1
     page = (tmp_path / 'gap.html').read_text()
     assert 'bad data' in page and page.index('class="said"') < page.index('<img')
 
@@ -142,5 +142,5 @@ def test_a_damaged_held_out_flight_gives_bad_data(tmp_path):
 def test_the_base_file_is_not_overwritten(tmp_path):
     (tmp_path / 'mine.yaml').write_text('extends: robot.yaml\n')
     with pytest.raises(ParameterError, match='extends'):
-        run_gap([tmp_path], robot=tmp_path / 'mine.yaml', apply=tmp_path / 'mine.yaml',
-                console=quiet())
+        gap_results([tmp_path], robot=tmp_path / 'mine.yaml', apply=tmp_path / 'mine.yaml',
+                    console=quiet())

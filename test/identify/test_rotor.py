@@ -29,7 +29,7 @@ def thrust_of(model, duty, voltage):
 
 
 def written(folder, results):
-    write_measured(folder / 'robot.yaml', RobotParameters.load(), None, '', [], None,
+    write_measured(folder / 'robot.yaml', RobotParameters.load(), None, [], None,
                    rotor_values(results))
 
 

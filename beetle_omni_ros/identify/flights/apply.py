@@ -12,7 +12,7 @@ from beetle_omni_ros.identify.flights.keys import names_of, number_of
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.schema import ParameterError
+from beetle_omni_ros.model.schema import nest, ParameterError
 
 MEMBERS = 4     # length of a list with one value for each rotor or joint
 
@@ -39,9 +39,7 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
             elif spec.of_each:
                 own = number_of(robot, spec.number) if spec.number else spec.neutral
                 value = _of_each(values.get(parameter, own), found)
-            low, high = spec.low, spec.high
-            values[parameter] = [rounded(min(max(v, low), high)) for v in value] \
-                if isinstance(value, (list, tuple)) else rounded(min(max(value, low), high))
+            values[parameter] = rounded(np.clip(value, spec.low, spec.high))
     return effects
 
 
@@ -69,22 +67,16 @@ def own_numbers(robot: RobotParameters, tolerances: dict[str, dict],
             found = [tolerances[key]['deviation'] for key in names_of(name, parameter)
                      if key in tolerances]
             if spec.number and found and name not in {*robot.effects, *named}:
-                _put(result, spec.number, number_of(robot, spec.number) * np.exp(
-                    found if len(found) > 1 else found[0]))
+                value = number_of(robot, spec.number) * np.exp(
+                    found if len(found) > 1 else found[0])
+                result[spec.number] = np.asarray(value).tolist()
     moved = [tolerances.get(f'position.offset[{k}]', {'deviation': 0.0})['deviation']
              for k in range(12)]
     if any(moved):
-        _put(result, 'rotors.positions', robot.rotors.positions + np.reshape(moved, (4, 3)))
+        result['rotors.positions'] = (robot.rotors.positions + np.reshape(moved, (4, 3))).tolist()
     if any(moved) or 'mass' in result:      # alone they would move the inertia
         result.setdefault('inertia', robot.inertia.tolist())
-    return result
-
-
-def _put(content, key, value):
-    *parts, last = key.split('.')
-    for part in parts:
-        content = content.setdefault(part, {})
-    content[last] = np.asarray(value).tolist()
+    return nest(result)
 
 
 def _of_each(own, found):
@@ -134,7 +126,7 @@ def write_corrected(path: Path, results: dict, robot: RobotParameters,
                              for key, entry in effect['parameters'].items()}}
              for effect in results['effects']]
     numbers = own_numbers(robot, results.get('tolerances') or {}, effects) if tolerances else {}
-    content = {**_plain(numbers), 'effects': _plain(effects), 'provenance': _plain({
+    content = {**rounded(numbers), 'effects': rounded(effects), 'provenance': rounded({
         'written_by': f'beetle_omni gap {__version__}',
         'date': datetime.now(timezone.utc).strftime('%Y-%m-%d'),
         'runs': results['meta']['runs'], 'holdout': results['meta']['holdout'],
@@ -149,13 +141,3 @@ def _interval(entry):
     """The interval of a fitted parameter; {} for a number that was not fitted."""
     interval = entry.get('interval')
     return {'interval': interval} if interval and np.ptp(interval, axis=-1).any() else {}
-
-
-def _plain(value):
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return rounded(value)
-    return value

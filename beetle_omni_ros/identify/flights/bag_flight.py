@@ -82,6 +82,7 @@ class BagFlight:
         self._runs: dict[frozenset, np.ndarray] = {}    # deviations -> simulated servos
         self.trusted = self._trusted()
         first, count = self._starts[0], self._length * len(self._starts)
+        self._simulated = slice(first, first + count)       # rows of the servos' windows
         self.rows = first + THIN * np.arange(count // THIN)
         self.time = self.signals.t[self.rows]
         self._fine = low_pass(WIDEST, 1, p.grid)
@@ -146,10 +147,9 @@ class BagFlight:
                              skew[:, 1, 0] - skew[:, 0, 1]], axis=1) / 2
             result['W'] = within(self._poses, rate - seen, 0)[self.rows]
         if 'J' in groups:
-            first, count = self._starts[0], self._length * len(self._starts)
             run = self._runs.get(frozenset(theta.items()))
             run = self._servos([theta], theta)[0] if run is None else run
-            result['J'] = self._of_joints(self.signals.joints(theta)[3][first:first + count]
+            result['J'] = self._of_joints(self.signals.joints(theta)[3][self._simulated]
                                           - run.reshape(-1, 4))
         return result
 
@@ -212,18 +212,16 @@ class BagFlight:
         force, rate, turning = self.signals.imu(theta)
         world = np.einsum('nij,nj->ni', matrices(self.signals.pose(theta)[1]), force)
         world[:, 2] -= self.robot.gravity
-        first, count = self._starts[0], self._length * len(self._starts)
         body = np.concatenate([force, turning], axis=1)
         seen = within(self._poses, np.concatenate([world, rate], axis=1), 0)
         return np.concatenate([body[self.rows], seen[self.rows], self._of_joints(
-            self.signals.joints(theta)[3][first:first + count])], axis=1)
+            self.signals.joints(theta)[3][self._simulated])], axis=1)
 
     def encoder_noise(self) -> np.ndarray:
         """(M, 16) drawn noise of the encoders, as large as that of their readings; others: 0."""
         noise = np.zeros((len(self.rows), len(self.channels)))
-        first, count = self._starts[0], self._length * len(self._starts)
-        noise[:, PLACE['J']] = self._of_joints(self.signals.drawn_reading_noise()[
-            first:first + count])
+        noise[:, PLACE['J']] = self._of_joints(
+            self.signals.drawn_reading_noise()[self._simulated])
         return noise
 
     def _groups_of(self, start):
@@ -258,15 +256,11 @@ class BagFlight:
             slopes[:, PLACE['J'], names.index(name)] = slope
         late = sorted(LATE_TILTS & set(names))
         if self.signals.model_tilts is not None and late:
-            slopes[:, PLACE['B'], [names.index(name) for name in late]] += \
-                self._of_late_tilts(theta, now['B'])[:, :, None]
+            h = self.keys[TILT_BUS].step
+            run, = self._servos([{**theta, TILT_BUS: theta.get(TILT_BUS, 0.0) + h}], theta)
+            moved = self._with_tilts(self.signals.model_tilts, run, theta, 'B')['B'] - now['B']
+            slopes[:, PLACE['B'], [names.index(name) for name in late]] += moved[:, :, None] / h
         return slopes
-
-    def _of_late_tilts(self, theta, now):
-        """Derivative (M, 6) of forces and torques by the delay of the tilts of a servo model."""
-        h = self.keys[TILT_BUS].step
-        run, = self._servos([{**theta, TILT_BUS: theta.get(TILT_BUS, 0.0) + h}], theta)
-        return (self._with_tilts(self.signals.model_tilts, run, theta, 'B')['B'] - now) / h
 
     def _of_pose_shift(self, theta):
         """
@@ -330,8 +324,8 @@ class BagFlight:
 
     def _use_tilts(self, tilts, run):
         """Take the fast tilts from simulated servos, beside their windows from ``tilts``."""
-        tilts, first = tilts.copy(), self._starts[0]
-        tilts[first:first + run.size // 4] = run.reshape(-1, 4)
+        tilts = tilts.copy()
+        tilts[self._simulated] = run.reshape(-1, 4)
         self.signals.use_model_tilts(tilts)
 
     @property

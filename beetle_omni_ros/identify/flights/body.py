@@ -1,7 +1,5 @@
 """Body equations with every effect's parameters as symbols, for many samples at once."""
 
-from functools import cached_property
-
 import casadi as ca
 import numpy as np
 
@@ -66,6 +64,7 @@ class BodyModel:
         rotation = dynamics.rotation_matrix(x['quaternion'])
         force = rotation.T @ (acceleration + ca.DM([0, 0, robot.gravity]))
         self._out = ca.cse(ca.densify(ca.vertcat(force, turning)))
+        self._function = native.compiled(ca.Function('body', [*x.values(), p], [self._out]))
         self._maps: dict = {}
 
     def _symbol(self, keys, name, parameter):
@@ -76,10 +75,6 @@ class BodyModel:
             symbol = self._p[self._index[key.name]]
             result.append(key.base * ca.exp(symbol) if key.relative else key.base + symbol)
         return result[0] if found[0].index is None else tuple(result)
-
-    @cached_property
-    def _function(self):
-        return native.compiled(ca.Function('body', [*self._x.values(), self._p], [self._out]))
 
     def _over(self, what, count, make):
         """The function mapped over ``count`` samples, as buffer and evaluation."""
@@ -134,9 +129,3 @@ def tilting_modules(robot: RobotParameters) -> tuple[float, float]:
     module = robot.multibody.module
     depth = -float(module.centre_of_mass[2])
     return float(module.inertia[0] + module.mass * depth**2), float(module.mass * depth)
-
-
-def swing_of(robot: RobotParameters) -> float:
-    """Logarithm of the ratio of a module's inertia about its joint and the servo's inertia."""
-    inertia = tilting_modules(robot)[0]
-    return float(np.log(max(inertia / robot.joints.inertia, 1.0))) if inertia else 0.0

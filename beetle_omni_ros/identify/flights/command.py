@@ -34,13 +34,7 @@ from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.show.page import print_end, print_grids, Terminal
 
-BAD_DATA = 3        # exit status
 LEAST_FITTED = 2    # bags; with more, the last one is held out if none is given
-
-
-def run_gap(*args, **options) -> int:
-    """Exit status of :func:`gap_results`: 3 for the verdict `bad_data`, else 0."""
-    return BAD_DATA if gap_results(*args, **options)['verdict'] == 'bad_data' else 0
 
 
 def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path | None = None,
@@ -93,7 +87,7 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
                 raise ParameterError(f'{option} {path}: expected flights, not logs of joints')
         from beetle_omni_ros.identify.servo.compare import analyse_joint_logs
         with console.status('comparing the servos'):
-            result, made_page = analyse_joint_logs(runs, holdout, model, robot)
+            result, made_page = analyse_joint_logs(runs, holdout, model)
     else:
         then = Planner(model, p, experiments(model), next_task) \
             if next_task and experiments else None
@@ -104,9 +98,10 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
                     if form else _bags(runs, holdout, robot, p, fix, alpha, status.update, then)
             result = results(model, then)
             result = learned(results, model, result) if learn else result
-        result['meta'] |= {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
-                           'robot': str(robot) if robot else 'params/robot.yaml', 'alpha': alpha}
+        result['meta']['alpha'] = alpha
         made_page = partial(_page, result, [*runs, *holdout])
+    result['meta'] |= {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
+                       'robot': str(robot) if robot else 'params/robot.yaml'}
     write_json(json_path, result)
     if page:
         write_text(page, made_page(), 'page')

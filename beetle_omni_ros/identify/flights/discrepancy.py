@@ -55,8 +55,7 @@ def _features_of(motion, time):
 
 def of_thrusts(robot: RobotParameters, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Directions (N, 4, 3) of thrusts; force and torque channels (N, 6, 4) by a newton of each."""
-    yaw = np.array(robot.rotors.arm_yaw)
-    axes = np.stack([np.sin(tilt) * np.sin(yaw), -np.sin(tilt) * np.cos(yaw), np.cos(tilt)], 2)
+    axes = robot.thrust_directions(tilt)
     turning = np.cross(robot.rotors.positions, axes) / robot.inertia
     return axes, np.concatenate([axes / robot.mass, turning], axis=2).transpose(0, 2, 1)
 

@@ -138,14 +138,13 @@ def write_effect(path: Path, result: dict, robot: RobotParameters) -> None:
     sizes = effect['parameters'].values()
     content = {
         'expressions': effect['expressions'], 'units': [size['unit'] for size in sizes],
-        **{f'{key}s': [np.vectorize(rounded)(size[name]).tolist() for size in sizes]
+        **{f'{key}s': [rounded(size[name]) for size in sizes]
            for key, name in (('coefficient', 'value'), ('interval', 'interval'))},
         'source': {
             'written_by': f'beetle_omni gap --learn {__version__}',
             **{key: result['meta'][key] for key in ('runs', 'holdout', 'robot')},
             'robot_hash': robot.hash(), 'beside': [label(each) for each in beside],
-            **{key: rounded(found) if isinstance(found, float) else found
-               for key, found in result[FORMULA].items()}}}
+            **rounded(result[FORMULA])}}
     write_text(path, '# An effect for robot files, `effects: {formula: FILE}`. SI units; '
                'intervals of 95 %; see docs/gap.md.\n'
                + yaml.safe_dump(content, sort_keys=False, width=95), 'effect')

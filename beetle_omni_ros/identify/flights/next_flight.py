@@ -12,26 +12,28 @@ written.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import log
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import log_prior, Normal, normal, Solution
-from beetle_omni_ros.identify.flights.flat import flat_flight
 from beetle_omni_ros.identify.flights.results import member_of, named_of, parameters, Starts
 from beetle_omni_ros.identify.flights.spectrum import pooled
+from beetle_omni_ros.identify.flights.table_flight import TableFlight
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.inference.noise import few_blocks
 from beetle_omni_ros.identify.recording.bag import recording_of
 from beetle_omni_ros.identify.recording.flight import prepare, UnusableFlight
 from beetle_omni_ros.identify.recording.parameters import GapParameters
+from beetle_omni_ros.identify.recording.series import turning
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
@@ -100,27 +102,21 @@ def posterior_of(engine: Engine, solution: Solution, equations: Normal,
     return covariance @ right, covariance
 
 
-class Gain:
-    """What the measurements of a flight are worth."""
-
-    def __init__(self, engine: Engine, solution: Solution):
-        self._engine = engine
-        self._blocks = sum(len(each.residual) for each in solution.spectra)
-
-    def information(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
-        """(K, K) information of blocks of one flight without what differs between flights."""
-        engine, total = self._engine, np.sum(grams, axis=0)
-        own = np.flatnonzero(engine.flight > 0)
-        inner = np.linalg.inv(total[np.ix_(own, own)] + np.diag(engine.flight[own]**-2))
-        total = total - total[:, own] @ inner @ total[own]
-        return total / few_blocks(engine.alpha / len(engine.entries), self._blocks + len(grams))
+def information(engine: Engine, solution: Solution, grams: Sequence[np.ndarray] | np.ndarray
+                ) -> np.ndarray:
+    """(K, K) information of blocks of one more flight, without what differs between flights."""
+    total, own = np.sum(grams, axis=0), np.flatnonzero(engine.flight > 0)
+    inner = np.linalg.inv(total[np.ix_(own, own)] + np.diag(engine.flight[own]**-2))
+    total = total - total[:, own] @ inner @ total[own]
+    blocks = sum(len(each.residual) for each in solution.spectra) + len(grams)
+    return total / few_blocks(engine.alpha / len(engine.entries), blocks)
 
 
-class Outlook(Gain):
+class Outlook:
     """What a flight is expected to decide between hypotheses."""
 
     def __init__(self, engine: Engine, solution: Solution, hypotheses: Sequence[Explanation]):
-        super().__init__(engine, solution)
+        self._engine, self._solution = engine, solution
         self._hypotheses, self._scale = list(hypotheses), np.hypot(engine.narrow, engine.typical)
         odds = np.array([each.odds for each in hypotheses])
         self.odds, self.weights = odds, np.exp(odds - np.logaddexp.reduce(odds))
@@ -130,7 +126,8 @@ class Outlook(Gain):
     def chances(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """(H, 2) probability that each hypothesis, if true, is decided, and another one is."""
         s, rng = self._scale, np.random.default_rng(0)
-        values, vectors = np.linalg.eigh(s[:, None] * self.information(grams) * s)
+        values, vectors = np.linalg.eigh(
+            s[:, None] * information(self._engine, self._solution, grams) * s)
         keep = values > FAINT
         root = np.sqrt(values[keep]) * vectors[:, keep] / s[:, None]
         # mean (r,) and covariance (r, r) of the measurements under each hypothesis
@@ -148,11 +145,11 @@ class Outlook(Gain):
         return np.array(found)
 
 
-class Sight(Gain):
+class Sight:
     """What a flight is expected to show of single effects of typical size, if one is there."""
 
     def __init__(self, engine: Engine, solution: Solution, names: Sequence[str]):
-        super().__init__(engine, solution)
+        self._engine, self._solution = engine, solution
         self._info = normal(solution.spectra, engine.names, engine.flight).info
         count = len(engine.entries)
         self._least = log(1 / engine.alpha) + log_prior(0, count) - log_prior(1, count)
@@ -168,9 +165,9 @@ class Sight(Gain):
     def chances(self, grams: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """(H, 2) probability that each effect is named if it is there, and 0."""
         narrow = self._engine.narrow
+        info = self._info + information(self._engine, self._solution, grams)
         covariance = narrow[:, None] * np.linalg.inv(
-            narrow[:, None] * (self._info + self.information(grams)) * narrow
-            + np.eye(len(narrow))) * narrow
+            narrow[:, None] * info * narrow + np.eye(len(narrow))) * narrow
         # of an effect with several entries, that of the clearest one
         return np.array([[max(self._chance(covariance, c) for c in entries), 0.0]
                          for entries in self._keys.values()])
@@ -313,3 +310,53 @@ def plant_of(engine: Engine, solution: Solution, hypothesis: Explanation, robot:
         return robot_with(robot, effects_with(robot, named))
     except ParameterError:
         return robot
+
+
+def flat_flight(like: TableFlight, position: np.ndarray, yaw: np.ndarray) -> TableFlight:
+    """
+    A flight of level rotors without noise, which follows a motion exactly, without a simulator.
+
+    Position and yaw determine its attitude, thrusts and measurements (differential flatness,
+    Mellinger and Kumar 2011).
+
+    Args:
+        like: a flight, whose signals the new one has.
+        position: (N, 3) in world at the period of ``like`` [m].
+        yaw: (N,) [rad].
+
+    """
+    robot, h, n = like.robot, like.period, len(yaw)
+    velocity = np.gradient(position, h, axis=0)
+    acceleration = np.gradient(velocity, h, axis=0)
+    felt = acceleration + [0.0, 0.0, robot.gravity]
+    up = felt / np.linalg.norm(felt, axis=1, keepdims=True)
+    side = np.cross(up, np.stack([np.cos(yaw), np.sin(yaw), np.zeros(n)], axis=1))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    axes = Rotation.from_matrix(np.stack([np.cross(side, up), side, up], axis=2))
+    rate = turning(axes.as_quat(), h)
+    force = np.stack([np.zeros(n), np.zeros(n), np.linalg.norm(felt, axis=1)], axis=1)
+    torque = robot.inertia * np.gradient(rate, h, axis=0) + np.cross(rate, robot.inertia * rate)
+    # thrust and torques of level rotors, for each newton
+    x, y, _ = robot.rotors.positions.T
+    mixer = np.stack([np.ones(4), y, -x, -robot.rotors.spin
+                      * robot.rotors.torque_to_thrust_ratio])
+    thrust = np.column_stack([robot.mass * force[:, 2], torque]) @ np.linalg.inv(mixer).T
+    thrust += robot.rotors.time_constant * np.gradient(thrust, h, axis=0)   # before the lag
+    known = {'position': position, 'quaternion': axes.as_quat(), 'velocity': velocity,
+             'acceleration': acceleration, 'specific_force': force, 'angular_velocity': rate,
+             'thrust': thrust, 'tilt': np.zeros((n, 4)), 'attitude': axes.as_euler('xyz')}
+    values = {name: known[name] for name in like.table.values if name in known}
+    if 'velocity' in values and like.table.format.signals['velocity'].frame == 'body':
+        values['velocity'] = axes.inv().apply(velocity)
+    if (motor := robot.rotors.motor) is not None and 'duty' in like.table.values:
+        volts = np.linspace(0.0, motor.nominal_voltage, 200)
+        curve = np.maximum.accumulate(np.polynomial.polynomial.polyval(volts, motor.coefficients))
+        values['duty'] = np.interp(thrust, curve, volts) / motor.nominal_voltage
+        if 'voltage' in like.table.values:
+            values['voltage'] = np.full((n, 1), motor.nominal_voltage)
+    flight = TableFlight(replace(like.table, name='next flight', values=values), robot, like.body,
+                         like.keys)
+    lost = {name.split('_')[0] for name in flight.channels} - {
+        name.split('_')[0] for name in like.channels}
+    flight.without(tuple(lost), 'not in the flights before')
+    return flight

@@ -44,8 +44,10 @@ def summary(result: dict) -> str:
     if verdict in ('named', 'named_set'):
         parts = [_effect_text(effect) for effect in result['effects']]
         explain = 'explain' if len(parts) > 1 else 'explains'
+        closing = '' if result['closure'] is None else (
+            f'Adding it closes {result["closure"]:.0%} of the gap on {flown(result)}.')
         return ' '.join(filter(None, [f'{_capital(listed(parts))} {explain} the disagreement.',
-                                      _closing(result), _chance(result)]))
+                                      closing, _chance(result)]))
     if verdict == 'no_gap':
         text = 'Model and measurement agree to within noise and manufacturing tolerance.'
         if not result['hidden']:
@@ -57,17 +59,15 @@ def summary(result: dict) -> str:
     if verdict == 'not_decidable':
         return f'These data cannot decide: {reason}.'
     if verdict == 'unknown':
-        return ' '.join(filter(None, [f'No known effect explains the disagreement: {reason}.',
-                                      _partly(result), _chance(result)]))
+        partial = [' or '.join(effect['names']) for effect in result['partial']]
+        return ' '.join(filter(None, [
+            f'No known effect explains the disagreement: {reason}.',
+            f'{_capital(listed(partial))} would explain a part.' if partial else '',
+            _chance(result)]))
     further = len(result['bad_data']) - 1
     return (reason if reason.endswith('?') else f'{reason}.') + (
         f' {further} more {"fault is" if further == 1 else "faults are"} listed below.'
         if further > 0 else '')
-
-
-def _partly(result):
-    partial = [' or '.join(effect['names']) for effect in result['partial']]
-    return f'{_capital(listed(partial))} would explain a part.' if partial else ''
 
 
 def listed(words: list[str], last: str = 'and') -> str:
@@ -110,12 +110,6 @@ def flown(result: dict) -> str:
     """What the gap was measured on."""
     return 'the held-out part of the log' if 'joints' in result else \
         'the held-out flights' if result['held_out'] else 'the fitted flights'
-
-
-def _closing(result):
-    if result['closure'] is None:
-        return ''
-    return f'Adding it closes {result["closure"]:.0%} of the gap on {flown(result)}.'
 
 
 def _chance(result):

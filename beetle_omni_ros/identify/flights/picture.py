@@ -41,6 +41,8 @@ def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str
     candidates, sections = result['candidates'], []
     if candidates:
         least = log(1 / result['meta']['alpha'])
+        tolerances = [[name, f'{100 * e["deviation"]:.2f} %' if e['relative'] else
+                       f'{e["deviation"]:.2g}'] for name, e in result['tolerances'].items()]
         sections = [
             section('Evidence', 'Every entry of the catalogue that these flights were compared '
                     'with. An effect is named if its evidence outweighs the number of entries '
@@ -52,18 +54,15 @@ def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str
             section('Tolerances', 'Deviations of this robot from the robot file, as fitted and '
                     'not named; --tolerances writes masses, gains, lags and rotor positions to '
                     'the robot file.', '<details><summary>All numbers</summary>'
-                    f'{html(_tolerances(result))}</details>')]
+                    f'{html(Grid("", ["number", "deviation"], tolerances))}</details>')]
     with matplotlib.rc_context(figures.STYLE):
         picture = figures.svg(_damage(*damaged), 'damaged readings') if damaged else figures.svg(
             picture_of(result), 'disagreement and sizes') if result['where'] else ''
-    return page('Gap', _about(result['meta']), grids(result, brief=False), notes, sections,
+    meta = result['meta']
+    about = {'flights': meta['runs'], 'held out': meta['holdout'], 'robot file': [meta['robot']]}
+    return page('Gap', '; '.join(f'{word}: {", ".join(runs)}' for word, runs in about.items()
+                                 if runs), grids(result, brief=False), notes, sections,
                 head(result, picture))
-
-
-def _about(meta):
-    """Flights and robot file in one line."""
-    parts = {'flights': meta['runs'], 'held out': meta['holdout'], 'robot file': [meta['robot']]}
-    return '; '.join(f'{word}: {", ".join(runs)}' for word, runs in parts.items() if runs)
 
 
 def head(result: dict, picture: str = '') -> str:
@@ -86,18 +85,14 @@ def picture_of(result: dict) -> Figure:
     axes[0, 0].set_yticks(place, [row['channel'] for row in rows])
     axes[0, 0].set_xlabel('RMS of measured minus expected, over the noise')
     figures.legend(figure, axes[0, 0])
-    if sizes:
-        _draw(axes[0, 1], sizes[::-1])
+    for axis in axes[0, 1:]:        # only with sizes
+        for k, (_, middle, low, high) in enumerate(sizes[::-1]):
+            axis.plot([low, high], [k, k], color=figures.INK, lw=1.4)
+            axis.plot(middle, k, 'o', color=figures.AFTER, ms=4)
+        axis.axvline(0.0, color=figures.BEFORE, lw=0.9)
+        axis.set_yticks(np.arange(len(sizes)), [text for text, *_ in sizes[::-1]])
+        axis.set_xlabel('deviation in typical sizes, 95 %')
     return figure
-
-
-def _draw(axis, sizes):
-    for k, (_, middle, low, high) in enumerate(sizes):
-        axis.plot([low, high], [k, k], color=figures.INK, lw=1.4)
-        axis.plot(middle, k, 'o', color=figures.AFTER, ms=4)
-    axis.axvline(0.0, color=figures.BEFORE, lw=0.9)
-    axis.set_yticks(np.arange(len(sizes)), [text for text, *_ in sizes])
-    axis.set_xlabel('deviation in typical sizes, 95 %')
 
 
 def _sizes(effects):
@@ -114,12 +109,6 @@ def _sizes(effects):
                 result.append((f'{text}\n{name}{more}', *(
                     (x - own) / found['typical'] for x in (value, *span))))
     return result
-
-
-def _tolerances(result):
-    rows = [[name, f'{100 * e["deviation"]:.2f} %' if e['relative'] else f'{e["deviation"]:.2g}']
-            for name, e in result['tolerances'].items()]
-    return Grid('', ['number', 'deviation'], rows)
 
 
 def _damage(recording, damage):

@@ -47,11 +47,6 @@ def fitted(engine: Engine, solution: Solution, k: int) -> np.ndarray:
     return x
 
 
-def noise_of(found: Spectrum) -> np.ndarray:
-    """(F, C) standard deviations of the noise of the coefficients."""
-    return np.sqrt(np.diagonal(found.noise, axis1=1, axis2=2))[found.band]
-
-
 def discrepancy_sizes(engine: Engine, solution: Solution) -> list[float]:
     """RMS of the discrepancy in each channel, with its unit."""
     weights = solution.equations.of_generic(solution.theta)
@@ -120,7 +115,8 @@ def where_of(engine: Engine, solution: Solution) -> list[dict]:
     whitened, raw = [], []
     for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
         x = fitted(engine, solution, k)
-        whitened.append([(rest / noise_of(found)).reshape(-1, len(engine.channels))
+        deviations = np.sqrt(np.diagonal(found.noise, axis1=1, axis2=2))[found.band]
+        whitened.append([(rest / deviations).reshape(-1, len(engine.channels))
                          for rest in (found.residual, found.at(x))])
         raw.append([np.where(flight.mask, flight.linear(at, []).residual, np.nan)
                     for at in ({}, dict(zip(engine.names, engine.point_of(solution, x),

@@ -174,8 +174,9 @@ def module_load(signals: Signals, theta: dict[str, float]) -> np.ndarray:
         return load
     module, turning = parts.module, signals.imu(theta)[2]
     outward, _, up = module.centre_of_mass
+    normals = robot.thrust_directions(tilt)
     for i, axis in enumerate(robot.tilt_axes):
-        normal = _normal(axis, tilt[:, i:i + 1])
+        normal = normals[:, i]
         place = robot.rotors.positions[i] + (outward - module.rotor_offset) * axis + up * normal
         pull = -module.mass * up * np.cross(normal, _felt(signals, theta, place)) @ axis
         load[:, i] = pull - module.inertia[0] * turning @ axis
@@ -195,9 +196,10 @@ def undescribed_load(signals: Signals, theta: dict[str, float]) -> tuple[np.ndar
     if robot.multibody is not None:
         return ()
     hanging, turning = np.empty_like(tilt), -signals.imu(theta)[2] @ robot.tilt_axes.T
+    normals = robot.thrust_directions(tilt)
     for i, axis in enumerate(robot.tilt_axes):
         felt = _felt(signals, theta, robot.rotors.positions[i])
-        hanging[:, i] = np.cross(_normal(axis, tilt[:, i:i + 1]), felt) @ axis
+        hanging[:, i] = np.cross(normals[:, i], felt) @ axis
     return hanging, turning
 
 
@@ -205,12 +207,6 @@ def _felt(signals, theta, place):
     """Specific force (N, 3) at a point of the body, in body axes [m/s^2]."""
     force, rate, turning = signals.imu(theta)
     return force + np.cross(turning, place) + np.cross(rate, np.cross(rate, place))
-
-
-def _normal(axis, tilt):
-    """(N, 3) thrust direction of a rotor at tilts (N, 1)."""
-    level = np.cross(axis, [0.0, 0.0, 1.0])
-    return np.cos(tilt) * [0.0, 0.0, 1.0] + np.sin(tilt) * level
 
 
 def starts_of(key: Key, models: Sequence) -> tuple[tuple[float, ...], ...]:

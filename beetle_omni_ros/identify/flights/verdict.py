@@ -10,7 +10,7 @@ import numpy as np
 
 from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.balance import Balance, SLOW
-from beetle_omni_ros.identify.flights.body import BodyModel, swing_of, tilting_modules
+from beetle_omni_ros.identify.flights.body import BodyModel, tilting_modules
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import Solution
 from beetle_omni_ros.identify.flights.keys import (
@@ -168,7 +168,8 @@ def _delays(robot, p, coarse):
     """
     bus, imu = (-p.command_delay, p.bus_late), p.coarse_imu if coarse else p.imu_averaging
     stamps = 2 * p.tolerance_delay      # a reading of the latest IMU may be as much later
-    swing = swing_of(robot)
+    # A module can swing with the joint: its inertia over the servo's, as a logarithm.
+    swing = float(np.log(max(tilting_modules(robot)[0] / robot.joints.inertia, 1.0)))
     deviations = {TILT_BUS: p.bus_near, THRUST_BUS: p.bus_near, IMU_LAG: imu,
                   SWING: p.tolerance_swing + swing}
     limits = {TILT_BUS: bus, THRUST_BUS: bus, IMU_LAG: (0.0, imu + stamps),

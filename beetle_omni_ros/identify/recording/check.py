@@ -163,9 +163,10 @@ class Comparison:
     def _agreement(self, relation: Relation, signals: Smoothed) -> Agreement:
         late, early = (self.kernel(x)[:len(self.centres)][self.fine]
                        for x in relation.pair(signals))
+        edge = self.limits.edge     # below it, white noise has this variance after derivatives
         return Agreement(late, early, self.limits.noise**2 * sum(
-            _below(self.limits.edge, order) * float(signals.noise[topic][k])
-            for topic, k, order in relation.noise))
+            float(signals.noise[topic][k]) * 2 * (2 * np.pi)**(2 * order)
+            * edge**(2 * order + 1) / (2 * order + 1) for topic, k, order in relation.noise))
 
     def _judged(self, agreements, mistake=None, onset=0):
         # Below the edge, twice as many samples are independent in white noise; errors are not.
@@ -186,7 +187,8 @@ class Comparison:
 
     def explained(self) -> list[Damage]:
         """The most likely mistake, if it resolves a contradiction and makes no other one."""
-        tried = [self._with(mistake) for mistake in mistakes() if self._suspected(mistake)]
+        tried = [self._with(mistake) for mistake in mistakes() if set(self.wrong) & set(
+            [name for name in mistake.touches if RELATIONS[name].certain] or mistake.touches)]
         # A sensor can turn on the way; what a command means does not change during a flight.
         tried += [late for h in tried if h.mistake.topic != COMMAND and (late := self._since(h))]
         best = max([self.usual, *tried], key=lambda h: h.score)
@@ -200,10 +202,6 @@ class Comparison:
         # Some cause that is not listed has the odds of one more mistake.
         sure = float(1 / (weights.sum() + np.exp(-self.limits.prior)))
         return [self._damage(best.mistake, best.onset, sure)]
-
-    def _suspected(self, mistake):
-        certain = [name for name in mistake.touches if RELATIONS[name].certain]
-        return bool(set(self.wrong) & set(certain or mistake.touches))
 
     def _with(self, mistake):
         signals = self.signals.corrected(mistake.part or mistake.topic, mistake.undo)
@@ -239,8 +237,3 @@ class Comparison:
             'unexplained, or their ratio is wrong: sensor, range, or another flight')
             for name, a in self.usual.agreements.items()
             if name in self.wrong and RELATIONS[name].certain]
-
-
-def _below(edge, order):
-    """Variance of a derivative below an edge [Hz], over the density of white noise."""
-    return 2 * (2 * np.pi)**(2 * order) * edge**(2 * order + 1) / (2 * order + 1)

@@ -19,7 +19,7 @@ from beetle_omni_ros.identify.recording.bag import (
 )
 from beetle_omni_ros.identify.recording.check import checked
 from beetle_omni_ros.identify.recording.parameters import GapParameters, shipped
-from beetle_omni_ros.identify.recording.relations import THRUSTS
+from beetle_omni_ros.identify.recording.relations import series_of, THRUSTS
 from beetle_omni_ros.identify.recording.series import aligned
 from beetle_omni_ros.identify.recording.topics import begin_of
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -138,19 +138,17 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
 
 
 def _in_order(name, topic, recording, findings):
-    """Finite samples in ascending order, without repeated stamps."""
-    t, values = recording.times[topic], recording.values[topic]
-    fine = np.isfinite(t) & np.isfinite(values).all(axis=1)
+    """Series of a topic; what it lacks of the recorded messages is a finding."""
+    recorded = recording.times[topic]
+    fine = np.isfinite(recorded) & np.isfinite(recording.values[topic]).all(axis=1)
     if not fine.all():
         findings.append(f'{name}: {topic}: {int((~fine).sum())} messages hold no numbers')
-        t, values = t[fine], values[fine]
-    if back := int((np.diff(t) < 0).sum()):
+    if back := int((np.diff(recorded[fine]) < 0).sum()):
         findings.append(f'{name}: {topic}: {back} messages are out of order; sorted by stamp')
-    t, first = np.unique(t, return_index=True)
-    lost = len(values) - len(first)
-    if lost > 2:
+    t, values = series_of(recording, topic)
+    if (lost := int(fine.sum()) - len(t)) > 2:
         findings.append(f'{name}: {topic}: {lost} stamps occur twice')
-    return t, values[first]
+    return t, values
 
 
 def _without_gaps(name, series, lead, p, findings, origin):

@@ -86,8 +86,7 @@ class Smoothed:
 
     def lifting(self) -> tuple[np.ndarray, np.ndarray]:
         """Specific forces (N, 3) [m/s^2] by accelerometer and thrusts at the measured tilts."""
-        axes, tilt = self.robot.tilt_axes, self.data[JOINTS][0, :, :, None]
-        normals = np.cos(tilt) * [0, 0, 1] + np.sin(tilt) * np.cross(axes, [0.0, 0.0, 1.0])
+        normals = self.robot.thrust_directions(self.data[JOINTS][0])
         force = np.einsum('ni,nij->nj', self.data[COMMAND][0, :, 4:], normals)
         return self.data[IMU][0, :, :3], force / self.robot.mass
 

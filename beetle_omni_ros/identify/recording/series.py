@@ -15,6 +15,7 @@ THIN = 2            # decimation of the grid for the body equations
 BRIDGED = 0.06      # [s] gaps of inputs that interpolation bridges, about a rotor lag
 SMOOTH = 0.05       # [s] moving average of positions before their derivative
 EDGE = 1.0          # [s] at both ends, for smoothing and history
+STENCILS = (1.0,), (0.5, 0.0, -0.5), (1.0, -2.0, 1.0)     # of derivatives
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class LowPass:
 
     def __call__(self, x: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Filtered x (N, ...), or its derivative of order 1 or 2, at ``centres(N)``: (M, ...)."""
-        taps = _derived(tuple(self.taps), derivative) / self.period**derivative
+        taps = np.convolve(self.taps, STENCILS[derivative], 'same') / self.period**derivative
         shape = x.shape
         y = upfirdn(taps, x.reshape(shape[0], -1), 1, self.every, axis=0)
         first = (len(taps) - 1) // self.every
@@ -52,18 +53,6 @@ class LowPass:
         taps = len(self.taps) - 1
         last = (count - 1) // self.every
         return self.every * np.arange(taps // self.every, last + 1) - taps // 2
-
-
-@cache
-def _derived(taps, order):
-    taps = np.array(taps)
-    if order == 1:
-        padded = np.pad(taps, 1)
-        return ((padded[2:] - padded[:-2]) / 2)
-    if order == 2:
-        padded = np.pad(taps, 1)
-        return padded[2:] - 2 * padded[1:-1] + padded[:-2]
-    return taps
 
 
 @cache

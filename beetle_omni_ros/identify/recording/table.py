@@ -11,7 +11,15 @@ import numpy as np
 
 from beetle_omni_ros.model.files import LogError, read_table
 from beetle_omni_ros.model.resources import share_path
-from beetle_omni_ros.model.schema import load_yaml, ParameterError, quoted
+from beetle_omni_ros.model.schema import (
+    bind,
+    load_yaml,
+    numbers,
+    parameter,
+    ParameterError,
+    quoted,
+    unknown,
+)
 
 G = 9.80665     # [m/s^2] of a unit 'g', standard gravity
 # Signal -> width, and unit -> factor to SI.
@@ -35,28 +43,19 @@ FRAMES = {'position': ('world',), 'velocity': ('world', 'body'), 'acceleration':
           'quaternion': ('body_to_world', 'world_to_body'), 'specific_force': ('body',),
           'angular_velocity': ('body',), 'target_position': ('world',)}
 ORDERS = {'xyzw': (0, 1, 2, 3), 'wxyz': (1, 2, 3, 0)}
-KEYS = ('columns', 'unit', 'frame', 'sign', 'order', 'full', 'clock')
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Signal:
-    """
-    One signal of a format.
+    """One signal of a format."""
 
-    Attributes:
-        columns: names of its columns; None: this component is not recorded.
-        factor: (n,) factors from the column's unit to SI, with the declared sign.
-        frame: frame of a vector, or the direction of a quaternion.
-        order: index of x, y, z, w among the columns of a quaternion.
-        clock: name of the clock that stamps it; signals of one clock are synchronous.
-
-    """
-
-    columns: tuple[str | None, ...]
-    factor: np.ndarray
-    frame: str = ''
-    order: tuple[int, ...] = ()
-    clock: str = 'log'
+    columns: tuple = parameter(doc='its columns; null: this component is not recorded')
+    unit: str = parameter('1', doc='unit of the columns')
+    frame: str = parameter('', doc='frame of a vector, or direction of a quaternion')
+    sign: np.ndarray = parameter([1.0], doc='1 or -1 for each column', low=-1, high=1)
+    order: str = parameter('xyzw', doc='parts of the columns of a quaternion')
+    full: float = parameter(1.0, doc='value of full duty')
+    clock: str = parameter('log', doc='what stamps it; signals of one clock are synchronous')
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,8 @@ class Format:
             raise ParameterError(f'--format {name}: no such file; expected a YAML file or one of '
                                  f"the shipped formats {', '.join(shipped)}")
         content = load_yaml(path)
-        deviation = _number(content.pop('clock_deviation', 0.0), f"{path}: key 'clock_deviation'")
+        deviation = float(numbers(content.pop('clock_deviation', 0.0), f"{path}: key "
+                                  "'clock_deviation'", {'low': 0, 'high': None, 'unit': 's'}))
         name = str(content.pop('name', path.stem))
         signals = {key: _signal(key, value, str(path)) for key, value in content.items()}
         if 'time' not in signals:
@@ -102,45 +102,23 @@ class Format:
         return cls(name, signals, deviation)
 
 
-def _number(value, where):
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ParameterError(f'{where}: expected a number, found {quoted(value)}')
-    return float(value)
-
-
 def _signal(name, content, path):
-    where = f'{path}: key {name!r}'
     if name not in SIGNALS:
-        raise ParameterError(f"{where}: unknown signal; expected one of {', '.join(SIGNALS)}")
-    width, units = SIGNALS[name]
-    if not isinstance(content, dict) or not set(content) <= set(KEYS):
-        raise ParameterError(f"{where}: expected a mapping with keys of {', '.join(KEYS)}, found "
-                             f'{quoted(content)}')
-    columns = content.get('columns')
-    columns = [columns] if isinstance(columns, str) else columns
-    if not isinstance(columns, list) or len(columns) != width or not all(
-            column is None or isinstance(column, str) for column in columns):
-        raise ParameterError(f"{where}: 'columns': expected {width} names (null: not recorded), "
-                             f'found {quoted(columns)}')
-    sign = content.get('sign', [1] * width)
-    if not isinstance(sign, list) or len(sign) != width or not all(s in (1, -1) for s in sign):
-        raise ParameterError(f"{where}: 'sign': expected {width} of 1 or -1, found "
-                             f'{quoted(sign)}')
-    frames = FRAMES.get(name, ('',))
-    unit = _one_of(units, content, 'unit', '1', where)
-    frame = _one_of(frames, content, 'frame', frames[0], where)
-    order = _one_of(ORDERS, content, 'order', 'xyzw', where)
-    full = _number(content.get('full', 1.0), f"{where}: 'full'")
-    return Signal(tuple(columns), np.array(sign) * units[unit] / full, frame,
-                  ORDERS[order] if name == 'quaternion' else (), str(content.get('clock', 'log')))
-
-
-def _one_of(allowed, content, key, default, where):
-    value = str(content.get(key, default))
-    if value not in allowed:
-        raise ParameterError(f"{where}: {key!r}: expected one of {', '.join(allowed)}, found "
-                             f'{quoted(value)}')
-    return value
+        raise unknown(f'{path}: key {name!r}', 'signal', name, SIGNALS)
+    made, (width, units) = bind(Signal, content, path, f'{name}.'), SIGNALS[name]
+    for key, fits, expected in (
+            ('columns', len(made.columns) == width and all(
+                isinstance(column, str | None) for column in made.columns),
+             f'{width} names (null: not recorded)'),
+            ('sign', len(made.sign) in (1, width) and (abs(made.sign) == 1).all(),
+             f'{width} of 1 or -1'),
+            *((key, getattr(made, key) in known, f"one of {', '.join(known)}")
+              for key, known in (('unit', units), ('frame', ('', *FRAMES.get(name, ()))),
+                                 ('order', ORDERS)))):
+        if not fits:
+            raise ParameterError(f"{path}: key '{name}.{key}': expected {expected}, found "
+                                 f'{quoted(getattr(made, key))}')
+    return made
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,8 +159,9 @@ def read_flight(path: Path, form: Format) -> Table:
     count, values = len(next(iter(columns.values()))), {}
     for name, signal in form.signals.items():
         block = np.stack([columns[column] if column else np.full(count, np.nan)
-                          for column in signal.columns], axis=1) * signal.factor
-        block = block[:, signal.order] if signal.order else block
+                          for column in signal.columns], axis=1)
+        block = block * signal.sign * SIGNALS[name][1][signal.unit] / signal.full
+        block = block[:, ORDERS[signal.order]] if name == 'quaternion' else block
         values[name] = block * [-1, -1, -1, 1] if signal.frame == 'world_to_body' else block
     t = values.pop('time')[:, 0]
     if len(t) < 10 or not np.isfinite(t).all() or not (np.diff(t) > 0).all():

@@ -290,9 +290,13 @@ class _Sensor:
         steps = np.abs(np.diff(values, axis=0, prepend=values[:1]))
         steps[spans > 3 * np.median(spans)] = 0.0
         off = np.abs(values - median_filter(values, (NEIGHBOURS, 1), mode='nearest'))
+        # Relative to the motion, too, because a unit may be wrong.
+        here = median_filter(steps, (2 * NEIGHBOURS + 1, 1), mode='nearest')
         for size, what in ((off, 'are spikes or outliers, such as markers mistaken for others'),
                            (steps, 'are jumps: markers were swapped, or the origin was set')):
-            bad = (size > self._far(size, steps)).any(axis=1)
+            usual = np.quantile(size, 1 - self.limits.few, axis=0)
+            bad = (size > self.limits.outlier * np.maximum(
+                np.maximum(here, usual), self.scatter)).any(axis=1)
             if bad.any() and (size is off or self.topic == POSE):
                 k = int(np.argmax(bad))
                 return self.damage(
@@ -300,12 +304,6 @@ class _Sensor:
                     f'{size[k].max():.3g} {self.unit})', self.t[k],
                     bad if size is off and bad.mean() < self.limits.few else None)
         return None
-
-    def _far(self, size, steps):
-        """Least outliers; also relative to the motion, because a unit may be wrong."""
-        here = median_filter(steps, (2 * NEIGHBOURS + 1, 1), mode='nearest')
-        usual = np.quantile(size, 1 - self.limits.few, axis=0)
-        return self.limits.outlier * np.maximum(np.maximum(here, usual), self.scatter)
 
     def stuck(self):
         """

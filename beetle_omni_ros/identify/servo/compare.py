@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.flights.page import grids as flight_grids
-from beetle_omni_ros.identify.flights.page import summary
 from beetle_omni_ros.identify.flights.picture import head
+from beetle_omni_ros.identify.flights.results import result_of
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.inference.hierarchy import WIDTH
 from beetle_omni_ros.identify.servo.fit import (
@@ -43,12 +42,10 @@ NAMED = [name for name in ENTRIES if name in CATALOGUE]
 CERTAIN = np.log(len(NAMED) / ALPHA)    # [nat] gain of evidence of a named entry
 
 
-def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: RobotParameters,
-                       base: Path | None) -> tuple[dict, Callable[[], str]]:
+def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: RobotParameters
+                       ) -> tuple[dict, Callable[[], str]]:
     """
     Compare the first log with a robot file, and further ones and those of ``holdout`` with it.
-
-    ``base`` is the path of the robot file, for the record.
 
     Returns:
         results with the keys of flights, and a function that makes their HTML page.
@@ -60,14 +57,11 @@ def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: Rob
     log = read_joint_log(runs[0])
     others = [read_joint_log(path) for path in [*runs[1:], *holdout]]
     search, apart = compare(log, robot), identify([log], robot)
-    result, joints = gap_of(search, apart, robot), joint_results(apart, others, robot)
-    result['joints'], result['text'] = joints['joints'], joints['text']
-    sets = any(len(effect['names']) > 1 for effect in result['effects'])
-    result |= {'next_experiment': 'sine of 3.8 Hz and 0.25 rad for 10 s on the joints '
-               '(separates latency from bandwidth)' if sets else None,
-        'meta': {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
-                 'robot': str(base) if base else 'params/robot.yaml', 'version': __version__}}
-    result['summary'] = summary(result)
+    joints = joint_results(apart, others, robot)
+    result = gap_of(search, apart, robot, joints=joints['joints'], text=joints['text'])
+    if result['next_experiment']:
+        result['next_experiment'] = 'sine of 3.8 Hz and 0.25 rad for 10 s on the joints ' \
+            '(separates latency from bandwidth)'
 
     def made_page() -> str:
         tables = [*flight_grids(result),
@@ -89,7 +83,7 @@ def compare(log: JointLog, robot: RobotParameters) -> Search:
     return select(servos, (), NAMED, CERTAIN, named=True)
 
 
-def gap_of(search: Search, apart: Search, robot: RobotParameters) -> dict:
+def gap_of(search: Search, apart: Search, robot: RobotParameters, **more) -> dict:
     """
     Verdict, effects and errors, with the keys of a gap of flights (`flights/results.py`).
 
@@ -97,6 +91,7 @@ def gap_of(search: Search, apart: Search, robot: RobotParameters) -> dict:
         search: comparison with the robot file.
         apart: identification of the same log, whose error is the noise floor.
         robot: the robot file.
+        more: further keys of the results.
 
     """
     log, units = search.servos.logs[0], range(len(search.servos.units))
@@ -123,16 +118,21 @@ def gap_of(search: Search, apart: Search, robot: RobotParameters) -> dict:
               f'{1e3 * total["after"]:.1f} mrad after') + ('' if explained else (
                   f'; joint {numbers[worst]} keeps {1e3 * after[worst]:.1f} mrad, '
                   f'{1e3 * floor[worst]:.1f} mrad with every term'))
-    return {
-        'verdict': verdict, 'reason': reason, 'closure': closure, 'gap_before': ratio['before'],
-        'gap_after': ratio['after'], 'noise_floor': 1.0,
-        'effects': effects if explained else [], 'partial': [] if explained else effects,
-        'candidates': _candidates(search), 'hidden': [],
-        'where': sorted(({'channel': f'joint_{number}', 'regime': 'log',
-                          'excess': float(before[u] / floor[u]),
-                          'excess_after': float(after[u] / floor[u])}
-                         for u, number in enumerate(numbers)), key=lambda row: -row['excess']),
-        'held_out': True, 'bad_data': [], 'findings': []}
+    return result_of(
+        verdict, {}, reason, closure=closure, gap_before=ratio['before'],
+        gap_after=ratio['after'], noise_floor=1.0, effects=effects if explained else [],
+        partial=[] if explained else effects, held_out=True, candidates=[
+            {'name': name, 'accepted': name in search.chosen.entries,
+             'evidence': _evidence(search, name),
+             'reason': '' if name in search.chosen.entries else
+             'the evidence does not need it' if search.gains[name] < CERTAIN else
+             'less than an encoder count, or no better on left-out blocks'}
+            for name in sorted(search.gains, key=lambda name: -search.gains[name])],
+        where=sorted(({'channel': f'joint_{number}', 'regime': 'log',
+                       'excess': float(before[u] / floor[u]),
+                       'excess_after': float(after[u] / floor[u])}
+                      for u, number in enumerate(numbers)), key=lambda row: -row['excess']),
+        **more)
 
 
 def _evidence(search, name):
@@ -142,16 +142,6 @@ def _evidence(search, name):
     held = sign * (on.held - off.held)
     return {'ln_bayes_factor': search.gains[name], 'delta_bic': 2 * search.gains[name],
             'cv_gain': 2 * float(held.sum()), 'blocks_positive': int((held > 0).sum())}
-
-
-def _candidates(search):
-    """One row for each entry with its evidence, largest gain first."""
-    return [{'name': name, 'accepted': name in search.chosen.entries,
-             'evidence': _evidence(search, name),
-             'reason': '' if name in search.chosen.entries else
-             'the evidence does not need it' if search.gains[name] < CERTAIN else
-             'less than an encoder count, or no better on left-out blocks'}
-            for name in sorted(search.gains, key=lambda name: -search.gains[name])]
 
 
 def _effects(search, robot):

@@ -58,9 +58,21 @@ class JointLog:
 
     @cached_property
     def read_t(self) -> np.ndarray:
-        """(N,) times of the readings of fresh rows [s]; the others are nan."""
-        times = np.full(len(self.t), np.nan)
-        times[self.fresh] = reading_times(self.t[self.fresh], self.period)
+        """
+        (N,) times of the readings of fresh rows [s]; the others are nan.
+
+        A reading can appear one row late or early. Its time is the median of the times of its
+        neighbours, moved by whole periods. Readings in every row keep their times.
+        """
+        t, times = self.t[self.fresh], np.full(len(self.t), np.nan)
+        period = float(np.median(np.diff(t)))
+        if period >= 1.5 * self.period:
+            number = np.r_[0, np.cumsum(np.maximum(np.rint(np.diff(t) / period), 1))]
+            period = float(np.polyfit(number, t, 1)[0])
+            about = np.pad(t - number * period, NEIGHBOURS, mode='reflect')
+            windows = np.lib.stride_tricks.sliding_window_view(about, 2 * NEIGHBOURS + 1)
+            t = np.median(windows, axis=1) + number * period
+        times[self.fresh] = t
         return times
 
     @cached_property
@@ -173,24 +185,6 @@ def fresh_rows(measured: np.ndarray) -> np.ndarray:
     fresh[changed[-1]::period] |= measured.shape[1] - changed[-1] <= 1.5 * period or \
         bool((measured[:, changed[-1]:] == measured[:, -1:]).all())
     return fresh
-
-
-def reading_times(t: np.ndarray, row: float) -> np.ndarray:
-    """
-    Times of periodic readings (K,) from the times of the rows in which they appear [s].
-
-    A reading can appear one row late or early. Its time is the median of the times of its
-    neighbours, moved by whole periods. ``row`` is the time between rows [s]; readings in every row
-    keep their times.
-    """
-    period = float(np.median(np.diff(t)))
-    if period < 1.5 * row:
-        return t
-    number = np.r_[0, np.cumsum(np.maximum(np.rint(np.diff(t) / period), 1))]
-    period = float(np.polyfit(number, t, 1)[0])
-    about = np.pad(t - number * period, NEIGHBOURS, mode='reflect')
-    windows = np.lib.stride_tricks.sliding_window_view(about, 2 * NEIGHBOURS + 1)
-    return np.median(windows, axis=1) + number * period
 
 
 def read_joint_log(path: str | Path) -> JointLog:

@@ -115,10 +115,16 @@ def joint_results(search: Search, validations: Sequence[JointLog], robot: RobotP
     log, fit = search.servos.logs[0], search.chosen.fit
     joints = [_joint(search, unit, validations, robot)
               for unit, (k, *_) in enumerate(search.servos.units) if k == 0]
+    about: dict[str, list[str]] = {}    # sentence -> numbers of the joints that have it
+    for joint in joints:
+        for text in joint['text']:
+            about.setdefault(text, []).append(str(joint['joint']))
     return {'meta': {'log': log.name, 'logs': [each.name for each in search.servos.logs],
                      'validate': [other.name for other in validations],
                      'converged': bool(fit.converged), 'version': __version__},
-            'joints': joints, 'text': _merged(joints)}
+            'joints': joints, 'text': [
+                f'Joint{"s" if len(numbers) > 1 else ""} {", ".join(numbers)}: {text}'
+                for text, numbers in about.items()]}
 
 
 def _joint(search, unit, validations, robot):
@@ -202,16 +208,6 @@ def sentences(search: Search, unit: int, traded: list[list[str]], best: str) -> 
                     'the servo model and gives the errors above: the log does not determine the '
                     'servo. Log all its angles, in both directions, twice.')
     return text
-
-
-def _merged(joints):
-    """Sentences of all joints without repetition, with the numbers of their joints."""
-    about: dict[str, list[str]] = {}
-    for joint in joints:
-        for text in joint['text']:
-            about.setdefault(text, []).append(str(joint['joint']))
-    return [f'Joint{"s" if len(numbers) > 1 else ""} {", ".join(numbers)}: {text}'
-            for text, numbers in about.items()]
 
 
 def grids(results: dict) -> list[Grid]:

@@ -169,8 +169,6 @@ class Device(AbstractContextManager):
         raise NotImplementedError
 
 
-
-
 class EmulatedActuators:
     """
     Couples the devices with the simulator, which follows their goals and sets their sensors.
