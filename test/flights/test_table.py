@@ -38,6 +38,12 @@ def test_units_signs_orders_and_directions_are_those_that_the_format_declares(tm
     assert np.allclose(table.values['duty'][0], [1, 0, 0, 0])
 
 
+def test_a_single_column_needs_no_list_and_the_unit_1_no_quotes(tmp_path):
+    form = declared(tmp_path, FORMAT.replace('[ms]', 'ms') + 'voltage: {columns: u, unit: mV}\n')
+    assert form.signals['time'].columns == ('ms',) and form.signals['voltage'].columns == ('u',)
+    assert declared(tmp_path, FORMAT.replace('duty: {', 'duty: {unit: 1, ')).signals['duty']
+
+
 def test_empty_cells_and_lost_rows_are_samples_that_do_not_exist(tmp_path):
     path = tmp_path / 'flight.csv'
     lines = rows(range(0, 100, 10)) + '100,,0,1,1,0,0,0,,0,0,0\n' + rows(range(130, 200, 10))

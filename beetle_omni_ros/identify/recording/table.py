@@ -105,6 +105,10 @@ class Format:
 def _signal(name, content, path):
     if name not in SIGNALS:
         raise unknown(f'{path}: key {name!r}', 'signal', name, SIGNALS)
+    if isinstance(content, dict):   # a single column, and the unit 1, need no list and no quotes
+        content = content | {key: [value] if key == 'columns' else str(value)
+                             for key, value in content.items()
+                             if key in ('columns', 'unit') and isinstance(value, (str, int))}
     made, (width, units) = bind(Signal, content, path, f'{name}.'), SIGNALS[name]
     for key, fits, expected in (
             ('columns', len(made.columns) == width and all(
