@@ -4,7 +4,6 @@ Numbers of a comparison: metrics of all flights of one task and conditions, by c
 The summary is part of the JSON file, and the page takes each of its numbers from it.
 """
 
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
