@@ -206,8 +206,8 @@ class Trimming:
                 self._modified = None
         if self._modified is None:
             x, y, z = (0.5 * angle for angle in self.rotation)
-            turned = rotations.product(*given.quaternion.tolist(), x, y, z,
-                                       sqrt(1.0 - (x * x + y * y + z * z)))
+            a, b, c, d = given.quaternion.tolist()
+            turned = rotations.product(a, b, c, d, x, y, z, sqrt(1.0 - (x * x + y * y + z * z)))
             self._modified = PoseTarget(given.position + self.position, np.array(turned),
                                         given.stamp)
         return self._modified
