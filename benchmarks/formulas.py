@@ -95,7 +95,7 @@ def family(name):
 
 KINDS = {'left_out': [
     name for name, entry in effects.CATALOGUE.items() if name in treatment.TREATMENTS
-    and entry.layer in ('body', 'rotor') and entry.each != 'term'],
+    and entry.layer in ('body', 'rotor') and entry.each != 'term' and not entry.beside],
     'outside': [*FORCES, *GAINS], UNDISTURBED: [UNDISTURBED]}
 
 

@@ -6,7 +6,7 @@ Loss of height and errors of a policy in thousands of moves between random poses
 Rare failures need more moves than flights of the whole simulation give in an hour. Therefore the
 robots of the training environment fly: one rigid body without estimator and floor. Each robot has
 its own guidance, as on board, which gets the true state. `--without` omits parts of the guidance
-(unwinding, routing, trimming). Poses have the distribution of random100. The first move
+(unwinding, routing, easing, trimming). Poses have the distribution of random100. The first move
 of each robot is not counted. Needs torch, rsl-rl-lib and onnx (the `train` extra).
 """
 

@@ -248,8 +248,7 @@ class DisturbanceEstimator:
         self._begin_block()
 
     def _begin_block(self):
-        self._errors, self._changes = np.zeros(6), np.zeros(model.STATE_SIZE)
-        self._span = 0.0
+        self._errors, self._changes, self._span = np.zeros(6), np.zeros(model.STATE_SIZE), 0.0
 
     def _correct_tilt(self, state, present, step):
         """Compare the encoders with the tilt model at their capture time."""

@@ -2,8 +2,8 @@
 Guidance: functions that modify the pose targets of a controller without prediction or memory.
 
 Unwinding leads from a joint's stop through a level attitude back to the target, routing through an
-intermediate attitude if the shortest turn needs more than the travel of a joint. Trimming is an
-integral against the steady error. docs/explanation/policy.md has the reasons.
+intermediate attitude if the shortest turn needs more than the travel of a joint. Easing brings far
+targets nearer at first, trimming is an integral of steady errors: docs/explanation/policy.md.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.schema import ParameterError, quoted
 
-LAYERS = 'unwinding', 'routing', 'trimming'
+LAYERS = 'unwinding', 'routing', 'easing', 'trimming'
 # Unwinding
 ATTEMPTS = 2            # to unwind, for one target
 WOUND = 2.4             # [rad] a joint beyond is wound; hover with a force or payload needs less
@@ -33,6 +33,11 @@ STEP = 1.5              # in limits: an error decrease of this, or of half the e
 NEAR = 0.8              # [rad] distance at which the intermediate attitude is reached
 ANOTHER = 0.3           # [rad] change of the target that starts a new search
 DURATION = 1.5          # [s] longest time to an intermediate attitude, of both
+# Easing: largest horizontal distance at the begin of a move [m], and its rate [m/s]
+FIRST_DISTANCE, FARTHER = 1.5, 5.0
+BEGIN, RAISE = 2.0, 0.5     # [s] of a move in which a target is higher for a dive, [m] how much
+# A dive ends so far below start and target [m] with this deceleration [m/s^2].
+DIVE, BRAKE = 0.04, 3.0
 # Trimming: rate of the integral [1/s], and largest shift and turn of the target [m], [rad].
 TRIM_RATE, TRIM_DISTANCE, TRIM_ANGLE = 1.0, 0.06, 0.15
 # Smaller errors may be steady errors [m], [rad]; a faster robot is on its way [m/s], [rad/s].
@@ -42,7 +47,7 @@ LONGEST_STEP = 0.1      # [s] between two states; after a longer gap no integral
 
 class Guidance:
     """
-    Intermediate attitudes of unwinding and routing; otherwise trimming.
+    Intermediate attitudes of unwinding and routing, otherwise trimming; far targets are eased.
 
     Args:
         axes: (4, 3) unit tilt axes in base_link.
@@ -68,7 +73,7 @@ class Guidance:
         self._looked: np.ndarray | None = None  # attitude of the target of the last search
         # Attitudes on the way: smallest height, distance and tilt at which each is reached.
         self._way: list[tuple[np.ndarray, float, float, float]] = []
-        self._until = 0.0
+        self._until = self._begun = self._floor = 0.0
         self._failed: list[np.ndarray] = []     # tilts at the begin of each unwinding
         self._watch(-inf)
 
@@ -88,15 +93,24 @@ class Guidance:
             self._until = state.stamp + DURATION
             self._failed.append(state.tilt.copy())
             self._way = self._through_level(state, given)
-        if not self._way:
-            return self._trimming.target(state, given, in_charge) if 'trimming' in self._on \
-                else given
-        self._trimming = Trimming()     # the joints may be wound differently afterwards
-        attitude, height, _, _ = self._way[0]
-        position = given.position
-        if position[2] < height:
-            position = np.array([*position[:2], height])
-        return replace(given, position=position, quaternion=attitude)
+        if self._way:
+            self._trimming = Trimming()     # the joints may be wound differently afterwards
+            attitude, height, _, _ = self._way[0]
+            x, y, z = given.position
+            given = replace(given, position=np.array([x, y, max(z, height)]), quaternion=attitude)
+        elif 'trimming' in self._on:
+            given = self._trimming.target(state, given, in_charge)
+        return self._eased(state, given) if 'easing' in self._on else given
+
+    def _eased(self, state, shown):
+        """The target, nearer at the begin of a move, and higher while the robot dives."""
+        since, speed = max(0.0, state.stamp - self._begun), state.velocity.tolist()[2]
+        (a, b, c), (x, y, z) = state.position.tolist(), shown.position.tolist()
+        limit = FIRST_DISTANCE + FARTHER * since
+        share = limit / max(limit, hypot(x - a, y - b))
+        dives = speed < 0 and since < BEGIN and c - speed ** 2 / (2 * BRAKE) < self._floor - DIVE
+        return shown if share == 1.0 and not dives else replace(shown, position=np.array(
+            [a + share * (x - a), b + share * (y - b), z + RAISE * dives]))
 
     def diagnostics(self) -> dict[str, int]:
         """Counts since the last reset."""
@@ -105,7 +119,8 @@ class Guidance:
     def _take(self, state, given):
         """Begin with another target; search a route if its attitude differs from the last."""
         if self._given is None or not given.same_pose(self._given):
-            self._failed = []
+            self._failed, self._begun = [], state.stamp
+            self._floor = min(state.position[2], given.position[2])
             self._watch(-inf)
         self._given = given
         if self._looked is None \
@@ -124,8 +139,7 @@ class Guidance:
             self._way = []
         elif rotations.geodesic_angle(state.quaternion, attitude) < angle \
                 and np.abs(state.tilt).max() < tilt:
-            self._way = self._way[1:]
-            self._until = state.stamp + DURATION
+            self._way, self._until = self._way[1:], state.stamp + DURATION
         if not self._way:
             self._watch(state.stamp)
 
@@ -150,10 +164,8 @@ class Guidance:
         level = level_between(state.quaternion, given.quaternion, self._axes, self._failed)
         way = [(level, HEIGHT, ARRIVED, UNWOUND)]
         turn = rotations.log(rotations.multiply(rotations.conjugate(level), given.quaternion))
-        if np.linalg.norm(turn) > LONG_TURN:
-            half = rotations.multiply(level, rotations.exp(0.5 * turn))
-            way.append((half, HEIGHT, HALF_WAY, inf))
-        return way
+        half = rotations.multiply(level, rotations.exp(0.5 * turn))
+        return [*way, (half, HEIGHT, HALF_WAY, inf)] if np.linalg.norm(turn) > LONG_TURN else way
 
 
 class Trimming:
@@ -194,9 +206,8 @@ class Trimming:
                 self._modified = None
         if self._modified is None:
             x, y, z = (0.5 * angle for angle in self.rotation)
-            w = sqrt(1.0 - (x * x + y * y + z * z))
             a, b, c, d = given.quaternion.tolist()
-            turned = rotations.product(a, b, c, d, x, y, z, w)
+            turned = rotations.product(a, b, c, d, x, y, z, sqrt(1.0 - (x * x + y * y + z * z)))
             self._modified = PoseTarget(given.position + self.position, np.array(turned),
                                         given.stamp)
         return self._modified
@@ -252,9 +263,8 @@ def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
     levels = Rotation.from_rotvec(heading[:, None] * STRAIGHT_UP)
     cost = turning_cost(begin, levels, axes) + turning_cost(levels, goal, axes)
     tilts = tilts_along(turned(levels, goal)[1], axes)[:, -1]
-    failures = np.zeros(HEADINGS)
-    for wound in failed:
-        failures += np.all(np.abs(tilts - wound) < np.pi, axis=1)
+    failures = sum((np.all(np.abs(tilts - wound) < np.pi, axis=1) for wound in failed),
+                   np.zeros(HEADINGS))
     best = np.lexsort((cost, failures))[0]      # by failures, then by cost
     return levels[int(best)].as_quat()
 

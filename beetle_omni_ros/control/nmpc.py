@@ -161,8 +161,8 @@ class NmpcController:
                              # lead of a held target at which the lag has the rate limit
                              tilt_rate * p.horizon / -np.expm1(-p.horizon / servo_lag)]
         self._health, self._bounds = ALL_HEALTHY, self._all_bounds
-        # Plan and disturbance estimate do what routing and trimming do.
-        self._guidance = Guidance(robot.tilt_axes, f'{p.without},routing,trimming')
+        # Plan and disturbance estimate do what the other layers do.
+        self._guidance = Guidance(robot.tilt_axes, f'{p.without},routing,easing,trimming')
         self.guidance = self._guidance.text
         self.reset()
 

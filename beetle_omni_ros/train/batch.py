@@ -67,8 +67,8 @@ class Draw:
         """(N, size) uniform in +-half_width."""
         return self.uniform(size, -half_width, half_width)
 
-    def chance(self, probability: float) -> torch.Tensor:
-        """(N, 1) bool, true with this probability."""
+    def chance(self, probability: float | torch.Tensor) -> torch.Tensor:
+        """(N, 1) bool, true with this probability, a number or (N, 1)."""
         return self.uniform(1) < probability
 
     def direction(self) -> torch.Tensor:
@@ -85,8 +85,7 @@ class Draw:
         publication.
         """
         a, b, c = self.uniform(3).unbind(-1)
-        low, high = torch.sqrt(1 - a), torch.sqrt(a)
-        tau = 2 * torch.pi
+        low, high, tau = torch.sqrt(1 - a), torch.sqrt(a), 2 * torch.pi
         uniform = torch.stack((low * torch.sin(tau * b), low * torch.cos(tau * b),
                                high * torch.sin(tau * c), high * torch.cos(tau * c)), -1)
         z, flat = 2 * a - 1, 2 * torch.sqrt((1 - a) * a)

@@ -111,8 +111,7 @@ class TiltableQuadrotorEnv:
         """One period of all robots; sets observation, critic, reward, done, timeout."""
         requested = self.offset + self.scale * actions
         command = torch.clamp(requested, self._low, self._high)
-        s = self.state
-        limit = self._thrust_limit()
+        s, limit = self.state, self._thrust_limit()
         given = tuple(torch.cat((c[:, :4], torch.minimum(c[:, 4:], limit)), -1)
                       for c in (command, s['previous'], s['older']))
         x = self.physics.advance(s['x'], given, s['delays'][:, :2], s['wrench'], s['body'])
@@ -170,8 +169,7 @@ class TiltableQuadrotorEnv:
 
     def _push(self, s, x, draw):
         r = self.cfg.random
-        chance = s['pushed'] * (batch.PERIOD / r.push_period)
-        push = draw.uniform(1) < chance
+        push = draw.chance(s['pushed'] * (batch.PERIOD / r.push_period))
         # uniform, with the standard deviation of the parameters
         kick = torch.cat((draw.around(3 ** 0.5 * r.push_velocity, 3),
                           draw.around(3 ** 0.5 * r.push_rate, 3)), -1) * push * self.severity
@@ -279,9 +277,8 @@ class TiltableQuadrotorEnv:
     def _retarget(self, new, due, rotation, draw):
         target = self._starts.target(draw, new['x'][:, model.POSITION],
                                      new['x'][:, model.QUATERNION])
-        changed = dict(new)
-        for name, value in target.items():
-            changed[name] = torch.where(spread(due, value), value, new[name])
+        changed = new | {name: torch.where(spread(due, value), value, new[name])
+                         for name, value in target.items()}
         way = changed['target_position'] - new['target_position']
         turn = batch.geodesic(batch.matrix(changed['target_attitude']),
                               batch.matrix(new['target_attitude']))
@@ -293,21 +290,18 @@ class TiltableQuadrotorEnv:
         return changed
 
     def _observe(self, s, draw):
-        previous_action = (s['previous'] - self.offset) / self.scale
-        memory = self.cfg.memory
+        previous_action, memory = (s['previous'] - self.offset) / self.scale, self.cfg.memory
         return batch.actor_observation(self.cfg.random, s, previous_action, memory, draw), \
             batch.critic_observation(s, previous_action, self._torque_ratio, memory)
 
     def read_tally(self) -> dict[str, float]:
         """Averages since the last call, which then restart; waits for the device."""
-        values = self.tally.tolist()
+        count, reached, far, turned, reward, deaths, over, steps, *terms = self.tally.tolist()
         self.tally.zero_()
-        targets, steps = max(values[0], 1.0), max(values[7], 1.0)
-        result = {'targets': values[0], 'success_rate': values[1] / targets,
-                  'position_error_m': values[2] / targets,
-                  'attitude_error_deg': float(np.degrees(values[3] / targets)),
-                  'reward': values[4] / steps, 'deaths': values[5], 'episodes': values[5]
-                  + values[6], 'steps': values[7]}
-        for name, value in zip(rewards.TERMS, values[8:]):
-            result[f'reward/{name}'] = value / steps * getattr(self.cfg.reward, name)
-        return result
+        targets, each = max(count, 1.0), max(steps, 1.0)
+        return {'targets': count, 'success_rate': reached / targets,
+                'position_error_m': far / targets,
+                'attitude_error_deg': float(np.degrees(turned / targets)), 'reward': reward / each,
+                'deaths': deaths, 'episodes': deaths + over, 'steps': steps,
+                **{f'reward/{name}': value / each * getattr(self.cfg.reward, name)
+                   for name, value in zip(rewards.TERMS, terms)}}

@@ -147,8 +147,7 @@ class Starts:
         """New targets for robots at a pose, a fraction of them near it."""
         e = self._p.episode
         near = d.chance(e.hold_targets)
-        offset = d.uniform(3, -1.0, 1.0)
-        angle = d.around(1.0, 3)
+        offset, angle = d.uniform(3, -1.0, 1.0), d.around(1.0, 3)
         place = torch.where(near, position + NEAR_POSITION * offset, 0.5 * self._region * offset)
         turned = batch.product(attitude, batch.from_rotation_vector(NEAR_ANGLE * angle))
         free = d.attitude()

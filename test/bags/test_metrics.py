@@ -1,6 +1,5 @@
 """Metrics against cases with known results, and bag against memory."""
 
-
 import json
 
 import numpy as np

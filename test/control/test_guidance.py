@@ -16,6 +16,7 @@ from beetle_omni_ros.control.guidance import (
     MISSED_ANGLE,
     NEAR,
     PATIENCE,
+    RAISE,
     Trimming,
 )
 from beetle_omni_ros.model import rotations
@@ -32,8 +33,8 @@ def state(stamp, way=(0, 0, 0), turn=(0, 0, 0), target=GOAL, **changed):
     values = {'position': target.position - np.array(way), 'velocity': np.zeros(3),
               'quaternion': rotations.multiply(target.quaternion, rotations.conjugate(
                   rotations.exp(np.array(turn, dtype=float)))),
-              'angular_velocity': np.zeros(3), **changed}
-    return State(stamp, **values, tilt=np.zeros(4), tilt_velocity=np.zeros(4), tilt_stamp=stamp)
+              'angular_velocity': np.zeros(3), 'tilt': np.zeros(4), **changed}
+    return State(stamp, **values, tilt_velocity=np.zeros(4), tilt_stamp=stamp)
 
 
 def wait(trimming, seconds, begin=0.0, target=GOAL, **where):
@@ -46,8 +47,7 @@ def wait(trimming, seconds, begin=0.0, target=GOAL, **where):
 @given(SMALL, SMALL)
 def test_a_constant_tracking_error_is_trimmed_to_zero(way, turn):
     """The robot follows with a time constant of 0.3 s, much faster than the integral."""
-    trimming = Trimming()
-    position, lag = np.zeros(3), np.zeros(3)
+    trimming, position, lag = Trimming(), np.zeros(3), np.zeros(3)
     for k in range(700):
         shown = trimming.target(state(0.01 * k, way - position, turn - lag), GOAL)
         asked = rotations.log(rotations.multiply(
@@ -63,8 +63,7 @@ def test_a_constant_tracking_error_is_trimmed_to_zero(way, turn):
     {'way': (0.2, 0, 0)}, {'turn': (0, 0.5, 0)},
     {'way': (0.01, 0, 0), 'velocity': np.array([0, 0.3, 0])}])
 def test_the_trim_does_not_change_in_motion(where):
-    trimming = Trimming()
-    shown = wait(trimming, 2.0, **where)
+    shown = wait(Trimming(), 2.0, **where)
     assert shown.position == pytest.approx(GOAL.position)
     assert shown.quaternion == pytest.approx(GOAL.quaternion)
 
@@ -92,10 +91,7 @@ def unwinding():
 
 
 def stuck(stamp, **changed):
-    values = {'position': TARGET.position, 'velocity': np.zeros(3), 'quaternion': OFF,
-              'angular_velocity': np.zeros(3), 'tilt': WOUND, 'tilt_velocity': np.zeros(4),
-              **changed}
-    return State(stamp, **values, tilt_stamp=stamp)
+    return state(stamp, target=TARGET, **{'quaternion': OFF, 'tilt': WOUND, **changed})
 
 
 def fly(guidance, seconds, begin=0.0, target=TARGET, **changed):
@@ -115,26 +111,24 @@ def test_a_robot_stuck_at_a_joint_stop_gets_a_level_target_above_its_place_after
     assert guidance.diagnostics()['unwound'] == 1
 
 
-@pytest.mark.parametrize('low, high, goes_through_level', [
+@pytest.mark.parametrize('low, high, unwinds', [
     (0.8, 1.4, True), (0.3, 0.95, False), (0.4, 1.4, False)])
-def test_oscillation_about_the_limit_counts_as_missed_and_arrival_does_not(low, high,
-                                                                          goes_through_level):
-    guidance = unwinding()
-    shown = []
+def test_oscillation_about_the_limit_counts_as_missed_and_arrival_does_not(low, high, unwinds):
+    guidance, shown = unwinding(), []
     for k in range(300):
         part = low + (high - low) * (0.5 + 0.5 * np.sin(2 * np.pi * 0.01 * k))
         attitude = rotations.multiply(TARGET.quaternion, rotations.exp(
             np.array([0, part * MISSED_ANGLE, 0])))
         shown.append(guidance.target(stuck(0.01 * k, quaternion=attitude), TARGET))
-    assert any(t is not TARGET for t in shown) == goes_through_level
+    assert any(t is not TARGET for t in shown) == unwinds
 
 
 def test_the_target_returns_once_the_joints_are_unwound():
     guidance = unwinding()
     level = fly(guidance, 1.0)[-1]
-    assert fly(guidance, 0.1, 1.0, quaternion=level.quaternion)[-1].quaternion \
-        is level.quaternion     # still wound
-    assert fly(guidance, 0.1, 1.1, quaternion=level.quaternion, tilt=np.full(4, 0.5))[-1] is TARGET
+    assert fly(guidance, 0.1, 1.0, quaternion=level.quaternion)[-1].quaternion is level.quaternion
+    assert fly(guidance, 0.1, 1.1, quaternion=level.quaternion,
+               tilt=np.full(4, 0.5))[-1] is TARGET
 
 
 UPSIDE_DOWN = PoseTarget(np.array([0.0, 0.0, 1.5]), rotations.from_rpy(2.98, 0.02, 1.6))
@@ -181,7 +175,7 @@ def inverted(attitude, **changed):
 
 
 def wound_state(stamp=0.0, quaternion=START):
-    return State(stamp, PLACE, np.zeros(3), quaternion, np.zeros(3), TILT, np.zeros(4), stamp)
+    return state(stamp, position=PLACE, quaternion=quaternion, tilt=TILT)
 
 
 def test_a_route_is_searched_once_for_each_attitude_and_again_after_reset():
@@ -201,9 +195,28 @@ def test_a_route_is_searched_once_for_each_attitude_and_again_after_reset():
     assert routing.target(wound_state(8.0), inverted(END)).quaternion is not END
 
 
+def test_a_far_target_is_nearer_at_first_in_its_direction_at_its_height_and_attitude():
+    guidance, target = Guidance(AXES, 'unwinding, trimming'), inverted(START, position=PLACE + 4)
+    for stamp, distance in ((7.0, 1.5), (6.0, 1.5), (7.2, 2.5), (7.6, 4.5), (8.0, 32 ** 0.5)):
+        shown = guidance.target(wound_state(stamp), target)
+        assert shown.position - PLACE == pytest.approx([distance / 2 ** 0.5] * 2 + [4.0])
+        assert shown.quaternion is START
+    again = guidance.target(wound_state(9.0), inverted(START, position=PLACE - 4))
+    assert again.position - PLACE == pytest.approx([-1.5 / 2 ** 0.5] * 2 + [-4.0])
+
+
+@pytest.mark.parametrize('stamp, height, speed, dives', [
+    (0.3, 0.1, -1, True), (0.3, 0.1, -0.5, False), (0.3, -0.5, 0.1, False), (2.0, 0.1, -1, False)])
+def test_the_target_is_higher_while_the_robot_dives_at_first(stamp, height, speed, dives):
+    guidance = Guidance(AXES)
+    for now, z, v in ((0.0, 0.2, 0.0), (stamp, height, speed)):     # [m] above the target
+        shown = guidance.target(state(now, (0, 0, -z), velocity=np.array([0, 0, v])), GOAL)
+    assert shown.position == pytest.approx(GOAL.position + [0, 0, RAISE * dives])
+
+
 def test_layers_that_are_off_do_not_act_and_are_not_in_the_description():
-    assert Guidance(AXES).text == 'unwinding, routing, trimming'
-    assert Guidance(AXES, 'trimming, routing').text == 'unwinding'
+    assert Guidance(AXES).text == 'unwinding, routing, easing, trimming'
+    assert Guidance(AXES, 'trimming, routing').text == 'unwinding, easing'
     bare = Guidance(AXES, 'all')
     assert bare.text == 'none' and fly(bare, 2.0)[-1] is TARGET
     assert bare.target(wound_state(), inverted(END)).quaternion is END

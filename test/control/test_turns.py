@@ -63,8 +63,7 @@ def hovering(attitude):
 
 @settings(max_examples=60, deadline=None)
 @given(quaternions, quaternions, st.integers(0, 4))
-def test_a_detour_is_taken_where_the_shortest_rotation_exceeds_the_travel(start, end,
-                                                                        wound):
+def test_a_detour_is_taken_where_the_shortest_rotation_exceeds_the_travel(start, end, wound):
     tilt = hovering(start)
     if wound < 4:      # a joint and the opposite one, where a whole turn fits into the travel
         for joint in (wound, (wound + 2) % 4):

@@ -1,6 +1,5 @@
 """Dead reckoning after poses whose markers are tilted, or with a biased accelerometer."""
 
-
 from ekf_flights import GRAVITY, new_ekf
 import numpy as np
 import pytest

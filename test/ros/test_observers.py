@@ -77,8 +77,7 @@ def test_messages_of_real_publishers_are_recorded_and_checked(ros_domain):
                       'joint_bridge gimbal2'}
 
 
-def test_the_view_names_the_domains_with_a_flight_and_shows_the_only_one(
-        ros_domain, monkeypatch):
+def test_the_view_names_the_domains_with_a_flight_and_shows_the_only_one(ros_domain, monkeypatch):
     assert ros_domain not in domains_in_use()
     with closing(LiveGraph(domain=ros_domain)) as graph, claim('230/robot1/ekf_node'), \
             claim('231/ekf_node'), claim('231/sim_node'), claim('229/other_node'):

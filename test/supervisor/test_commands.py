@@ -1,6 +1,5 @@
 """Every reason for the refusal of a command, and accepted commands."""
 
-
 import numpy as np
 import pytest
 

@@ -1,6 +1,5 @@
 """Detectors: named faults, detection times, and no false alarms in healthy motion."""
 
-
 import numpy as np
 import pytest
 

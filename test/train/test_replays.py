@@ -1,6 +1,5 @@
 """Missed situations are stored, repeated unchanged, and dropped when reached."""
 
-
 from learning import only, quiet
 import pytest
 import torch

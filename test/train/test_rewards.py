@@ -1,6 +1,5 @@
 """Each reward term for prescribed states; the published ones against the paper's table."""
 
-
 import learning  # noqa: F401
 import numpy as np
 import pytest

@@ -19,8 +19,6 @@ from beetle_omni_ros.train.model import (
 )
 from beetle_omni_ros.train.starts import DRAWN, Starts, STRATA
 
-PERIOD = 0.01
-
 
 def test_strata_have_their_shares_in_every_part_of_the_batch():
     env = environment(robots=1000)
@@ -44,8 +42,7 @@ def test_each_stratum_has_the_starts_of_its_name(name):
             assert float((windings == value).float().mean()) == pytest.approx(1 / 3, abs=0.06)
     if name in ('wound_back', 'level', 'wound', 'mixed'):
         assert (x[:, model.THRUST] == ROBOT.hover_thrust).all()
-    moving = x[:, model.VELOCITY].any() or x[:, model.RATE].any()
-    assert bool(moving) == (name == 'moving')
+    assert bool(x[:, model.VELOCITY].any() or x[:, model.RATE].any()) == (name == 'moving')
     at_target = torch.isclose(x[:, model.QUATERNION], env.state['target_attitude']).all()
     assert bool(at_target) == (name == 'hold')
 
@@ -66,7 +63,6 @@ def test_a_hover_start_hovers():
 
 def test_a_target_lasts_exactly_its_time():
     env = quiet(only('hold'))
-    env.state['age'].zero_()
     env.state['target_left'].copy_(torch.arange(64) % 4 + 1)
     before, changed = env.state['target_position'].clone(), torch.zeros(64)
     for step in range(1, 6):
