@@ -99,6 +99,19 @@ def test_a_tolerance_with_limits_agrees_with_quadrature():
     assert judge.posterior(()).theta[0] < high + 3 * sigma
 
 
+def test_bounds_of_keys_that_are_nearly_the_same_leave_a_finite_evidence():
+    rng, own = np.random.default_rng(0), np.ones(3, dtype=bool)
+    judge = Judge(normal([linear_flight(rng, np.zeros(3))], ['a', 'b', 'c'], np.zeros(3)),
+                  np.full(3, 0.001), np.full(3, 0.02), np.tile([0.0, np.inf], (3, 1)), ~own,
+                  np.zeros(3, dtype=int), 0.05, ~own, np.zeros(3))
+    for _ in range(500):
+        slope = rng.normal(size=(3, 1)) * 10**rng.uniform(-2, 2)
+        wide = slope @ slope.T + np.eye(3) * 100**rng.uniform(-9, -3)
+        prior, estimate = 10**rng.uniform(-1, 3, 3), slope[:, 0] - rng.uniform(0, 10)
+        value, mean, covariance = judge._bounded(np.arange(3), estimate, wide, prior, own)
+        assert np.isfinite([value, *mean, *covariance.ravel()]).all()
+
+
 def test_an_effect_of_the_least_size_has_the_needed_evidence_in_the_mean():
     rng = np.random.default_rng(4)
     found = normal([linear_flight(rng, np.zeros(1), keys=1)], ['a'], np.zeros(1))

@@ -27,6 +27,7 @@ from beetle_omni_ros.identify.inference.noise import few_blocks, within_limits
 SCALES = 1.0, 3.0, 9.0  # times typical: the prior of a candidate is a mixture of these
 MIXED = log(len(SCALES))    # its price
 EXACT = 1e-3            # deviation of a factor that is one
+ROUNDING = 1e-12        # share of a prior's variance: a bound may leave less of a nearly equal key
 
 
 @dataclass(eq=False)
@@ -299,9 +300,9 @@ class Judge:
         Ln of the density of an estimate, and mean and covariance of its keys within their bounds.
 
         The priors are normal about zero, or about one for the factor of an effect that acts, and
-        end at the bounds. The bounds of one key after the other cut the
-        posterior, which stays normal with the mean and the covariance of what remains. The upper
-        limit of a tolerance does not hold for a candidate. The lower one is physical.
+        end at the bounds. The bounds of one key after the other cut the posterior, which stays
+        normal with the mean and the covariance of what remains. The upper limit of a tolerance
+        does not hold for a candidate. The lower one is physical.
         """
         if not len(c):
             return 0.0, estimate, wide
@@ -311,16 +312,15 @@ class Judge:
         inverse = np.linalg.inv(both)
         # the normal density of an estimate with the covariance of noise and prior
         value = -0.5 * (estimate @ inverse @ estimate + np.linalg.slogdet(2 * pi * both)[1])
-        share = variance[:, None] * inverse
-        total, mean = np.diag(variance) - share * variance, share @ estimate
+        total, mean = (variance[:, None] * inverse @ part for part in (wide, estimate))
         for k in np.flatnonzero(self.bounded[c]):
             (low, high), size = np.subtract(self.bounds[c[k]], centre[k]), float(prior[k])
             high = inf if free[k] and self.kept[c[k]] else high
-            deviation, middle = sqrt(total[k, k]), float(mean[k])
+            deviation, middle = sqrt(max(total[k, k], ROUNDING * variance[k])), float(mean[k])
             chance, shift, left = within_limits(
                 (low - middle) / deviation, (high - middle) / deviation)
             value += chance - within_limits(low / size, high / size)[0]
-            change = total[:, k] / total[k, k]
+            change = total[:, k] / deviation**2
             mean = mean + change * (shift * deviation)
             total = total - change[:, None] * (total[k] * (1 - left))
         return value, mean + centre, total
