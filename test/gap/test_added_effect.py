@@ -59,7 +59,7 @@ def test_a_consumer_applies_the_added_effect_or_has_no_such_state(name, consumer
     (HEAT, {'loss_per_kelvin': 0.0, 'temperature': 50.0}, 0.004), (WARMING, {'loss': 0.0}, 0.1)])
 def test_the_gap_finder_identifies_the_added_effect(name, values, value):
     robot = replace(ROBOT, effects={name: values})
-    keys, key = {**all_keys(robot), **extra_keys()}, f'{name}.{next(iter(values))}'
+    keys, key = {**all_keys(robot), **extra_keys(robot)}, f'{name}.{next(iter(values))}'
     made = model(Motion(duration=10.0).flight(), robot, BodyModel(robot, keys, (0.0, 0.0)), keys)
     weak = made.residual({key: value}, 'B')
     assert np.abs(weak['B'] - made.residual({}, 'B')['B']).max() > 0.01
@@ -73,7 +73,7 @@ def test_an_effect_without_a_treatment_acts_as_the_file_has_it(monkeypatch):
     def residual(loss):
         robot = replace(ROBOT, effects={HEAT: {'loss_per_kelvin': loss, 'temperature': 50.0}}
                         if loss else {})
-        keys = {**all_keys(robot), **extra_keys()}
+        keys = {**all_keys(robot), **extra_keys(robot)}
         return model(Motion(duration=10.0).flight(), robot, BodyModel(
             robot, keys, (0.0, 0.0)), keys).residual({}, 'B')['B']
     treated, none = residual(0.004), residual(0.0)

@@ -171,7 +171,7 @@ def test_a_wind_velocity_moves_the_drag_and_has_no_key_without_one():
     true, names = np.array([2.0, -3.0, 0.5]), [f'wind_velocity.velocity[{k}]' for k in range(3)]
     assert not set(names) & set(KEYS)
     robot = replace(ROBOT, effects={'rotor_drag': {'coefficient': 0.4}})
-    keys = {**all_keys(robot), **extra_keys()}
+    keys = {**all_keys(robot), **extra_keys(robot)}
     made = model(MOTION.flight(), robot, BodyModel(robot, keys, (0.0, 0.0)), keys)
     air = np.tile(MOTION.attitude.inv().apply(true)[:, None], (1, 4, 1))
     more = on_rotors(0.1 * speeds()[:, :, None] * split(air)[1])     # than the drag in still air

@@ -145,7 +145,7 @@ def gap(name):
     made, own = flight_model(), KEYS
     if CATALOGUE[name].each == 'term' or CATALOGUE[name].beside:    # of what a robot has
         robot = replace(with_effect(name), multibody=None)
-        own = {**all_keys(robot), **extra_keys()}
+        own = {**all_keys(robot), **extra_keys(robot)}
         made = model(Motion(duration=10.0).flight(), robot, BodyModel(robot, own, (0, 0)), own)
     limit = TREATMENTS[name].limit     # beyond this calm flight
     theta = {key.name: np.log(1e-5 if limit else 1 - key.typical) if key.relative

@@ -52,7 +52,7 @@ def test_a_force_outside_the_candidates_is_found_with_its_size(made):
 
 def residual(robot, path):
     """RMS of the specific forces [m/s^2] that a robot file leaves of a flight."""
-    keys = {**all_keys(robot), **extra_keys()}
+    keys = {**all_keys(robot), **extra_keys(robot)}
     own = prepare(read_recording(path), robot, P, False)
     made = BagFlight(own, robot, BodyModel(robot, keys, (0.0, 0.0)), keys, P)
     return made.residual({}, 'B')['B'][made.mask[:, 0], :3].std()

@@ -64,7 +64,7 @@ def test_a_hidden_effect_is_named_though_the_sensors_differ_from_flight_to_fligh
 
 def one_flight(folder, **more):
     """The engine's model of one short flight."""
-    keys = {**all_keys(ROBOT), **extra_keys()}
+    keys = {**all_keys(ROBOT), **extra_keys(ROBOT)}
     flight, = flights(folder, 7, duration=20.0, fit=1, **more)
     return BagFlight(flight, ROBOT, BodyModel(ROBOT, keys, (0.0, 0.0)), keys, P)
 
