@@ -51,6 +51,29 @@ def test_late_tilt_commands_and_modules_that_load_the_servos_are_named_and_nothi
         assert low < true < high
 
 
+def test_a_weak_servo_and_one_with_play_are_named_and_written_to_the_file(tmp_path):
+    plant, fixed = tmp_path / 'plant.yaml', tmp_path / 'fixed.yaml'
+    plant.write_text('extends: robot.yaml\neffects:\n'
+                     '  joint_bandwidth: {kp: [0.3449, 0.3449, 0.25, 0.3449], kd: 0.0094}\n'
+                     '  joint_backlash: {gap: [0.03, 0, 0, 0]}\n')
+    bags = flown(tmp_path, 'random2', plant=plant)
+    found = {(effect['names'][0], effect['joint']) for effect in gap(bags, apply=fixed)['effects']}
+    assert found == {('joint_bandwidth', 3), ('joint_backlash', 1)}
+    assert not gap(bags, robot=fixed)['effects']
+    effects = yaml.safe_load(fixed.read_text())['effects']
+    assert effects['joint_bandwidth']['kp'] == pytest.approx(
+        [0.3449, 0.3449, 0.25, 0.3449], abs=0.01)
+    assert effects['joint_backlash']['gap'] == pytest.approx([0.03, 0, 0, 0], abs=0.006)
+
+
+def test_lags_of_rotors_far_beyond_their_tolerance_are_unknown_where_no_entry_has_them(tmp_path):
+    plant, less = tmp_path / 'plant.yaml', tmp_path / 'less.yaml'
+    plant.write_text('extends: robot.yaml\neffects: {rotor_lag: {time_constant: 0.06}}\n')
+    less.write_text('without: [rotor_lag]\n')
+    result = gap(flown(tmp_path, 'random2', plant=plant), parameters=less)
+    assert result['verdict'] == 'unknown' and 'of the lag of rotor' in result['reason']
+
+
 FORMAT = """
 clock_deviation: 0.001
 time: {columns: [t], unit: s}

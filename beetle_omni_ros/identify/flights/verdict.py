@@ -18,6 +18,7 @@ from beetle_omni_ros.identify.flights.keys import (
     entries_of,
     Entry,
     extra_keys,
+    Key,
     keys_of,
     LIMITS,
     MODULES,
@@ -77,7 +78,7 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     every = [BagFlight(flight, robot, body, keys, p) for flight in [*flights, *judging]]
     models, others = every[:len(flights)], every[len(flights):]
     late = first_point(models, every, robot)
-    starts = {name: own for name, own in _starts(keys, models).items()
+    starts = {name: own for name, own in starts_in(keys, models).items()
               if of_start(name)[0] not in p.without}
     tangents = {f'{name}~{key}': (name, key) for name, start in starts.items() for key in start}
     for model in every:
@@ -155,7 +156,7 @@ def first_point(models, every, robot):
     return late
 
 
-def _starts(keys, models):
+def starts_in(keys: dict[str, Key], models: Sequence[BagFlight]) -> Starts:
     """Name of a start -> deviations of the keys of its effect, of all joints or of one."""
     result = {}
     for name in LIMITS:
