@@ -56,7 +56,7 @@ def test_a_weak_servo_and_one_with_play_are_named_and_written_to_the_file(tmp_pa
     plant.write_text('extends: robot.yaml\neffects:\n'
                      '  joint_bandwidth: {kp: [0.3449, 0.3449, 0.25, 0.3449], kd: 0.0094}\n'
                      '  joint_backlash: {gap: [0.03, 0, 0, 0]}\n')
-    bags = flown(tmp_path, 'random2', plant=plant)
+    bags = flown(tmp_path, 'random3', plant=plant)
     found = {(effect['names'][0], effect['joint']) for effect in gap(bags, apply=fixed)['effects']}
     assert found == {('joint_bandwidth', 3), ('joint_backlash', 1)}
     assert not gap(bags, robot=fixed)['effects']
