@@ -54,7 +54,7 @@ def labels(truth):
         of, place, first = CATALOGUE[name].each, {}, next(iter(values))
         if of or CATALOGUE[name].parameters[first].of_each and np.ndim(values[first]):
             k = int(np.argmax(np.abs(values[first] - np.median(values[first]))))
-            values = {key: value[k] for key, value in values.items()}
+            values = {key: value[k] for key, value in values.items() if np.ndim(value)}
             place = {of or 'joint': k + 1}
         made.append({'name': name, **place, 'parameters': values})
     return made

@@ -1,5 +1,6 @@
 """The flight engine against dense algebra, quadrature, and flights with known effects."""
 
+from dataclasses import replace
 import json
 from pathlib import Path
 
@@ -110,6 +111,22 @@ def test_bounds_of_keys_that_are_nearly_the_same_leave_a_finite_evidence():
         prior, estimate = 10**rng.uniform(-1, 3, 3), slope[:, 0] - rng.uniform(0, 10)
         value, mean, covariance = judge._bounded(np.arange(3), estimate, wide, prior, own)
         assert np.isfinite([value, *mean, *covariance.ravel()]).all()
+
+
+@pytest.mark.parametrize('unit', [1e-6, 1e6])
+def test_evidence_is_the_same_in_all_units(unit):
+    rng, never = np.random.default_rng(6), np.zeros(2, dtype=bool)
+    found, gains = normal([linear_flight(rng, np.array([0.003, 0.0]), keys=2)], ['a', 'b'],
+                          np.zeros(2)), []
+    for size in (np.ones(2), np.array([1.0, unit])):
+        both = np.outer(size, size)
+        scaled = replace(found, info=found.info * both, right=found.right * size,
+                         scores=found.scores * size, slopes=found.slopes * both,
+                         noise=found.noise * both)
+        judge = Judge(scaled, 0.001 / size, 0.02 / size, np.full((2, 2), [-np.inf, np.inf]), never,
+                      np.arange(2), 0.05, never, np.zeros(2))
+        gains.append([judge.gain(*pair) for pair in (((0,), (1,)), ((0, 1), ()), ((1,), ()))])
+    assert gains[0] == pytest.approx(gains[1], rel=1e-6)
 
 
 def test_an_effect_of_the_least_size_has_the_needed_evidence_in_the_mean():

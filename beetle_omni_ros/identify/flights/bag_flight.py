@@ -199,9 +199,8 @@ class BagFlight:
     def _guided(self, theta, groups):
         """Residual with the tilts of the servo model at ``theta``, where they are of a model."""
         before, run = self.signals.model_tilts, self._runs.get(frozenset(theta.items()))
-        if before is None or run is None:
-            return self.residual(theta, groups)
-        return self._with_tilts(before, run, theta, groups)
+        return self.residual(theta, groups) if before is None or run is None \
+            else self._with_tilts(before, run, theta, groups)
 
     def _with_tilts(self, before, run, theta, groups):
         """Residual at ``theta`` with fast tilts of simulated servos, not those ``before``."""
@@ -306,9 +305,10 @@ class BagFlight:
 
     def _of_all(self, name, own):
         """Start of all joints with the slopes of one of a joint, as servos are independent."""
-        (effect, joint), other = of_start(name), name.partition('[')[0] + '@' + name[-1]
+        effect, joint = of_start(name)
         acts = any(of_start(each)[0] == effect for each in own)
-        return other if joint and not acts and self._groups_of(name) == 'J' else None
+        return f'{effect}@{name.partition("@")[2]}' \
+            if joint and not acts and self._groups_of(name) == 'J' else None
 
     def _ends(self, name, theta, own):
         """Deviations without the effect of a start, and with it as far as it acts, else whole."""
