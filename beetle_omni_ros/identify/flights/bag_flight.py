@@ -107,8 +107,7 @@ class BagFlight:
             bad |= commanded > p.limit_margin * most
         # Rotor lag: a limit also affects the following samples.
         memory = round(5 * self.robot.rotors.time_constant / p.grid)
-        spread = np.convolve(bad, np.ones(memory))[:len(bad)] > 0
-        return ~spread
+        return np.convolve(bad, np.ones(memory))[:len(bad)] == 0
 
     def _inputs(self, theta):
         """Inputs of the body equations, name -> (M, width)."""
