@@ -179,10 +179,10 @@ def test_faults_of_a_file_act_and_are_listed_in_the_results(tmp_path):
     task = make_task('random1')
     task = replace(task, segments=(replace(task.segments[0], duration=3.0),))
     path = tmp_path / 'faults.yaml'
-    path.write_text('faults: {two: {strike: [{kind: rotor_stops, at: 1.0, rotor: 2}, '
+    path.write_text('faults: {two: {strike: [{kind: mocap_lost, at: 1.0, duration: 0.1}, '
                     '{kind: controller_silent}]}}')
     results = evaluate(task, ('hover',), faults=path, bag=tmp_path / 'bag')
-    listed = ['rotor_stops at=1 rotor=2', 'controller_silent at=0']
+    listed = ['mocap_lost at=1 duration=0.1', 'controller_silent at=0']
     assert results['meta']['faults'] == listed
     log = read_bag(tmp_path / 'bag')
     assert log.meta['faults'] == listed
