@@ -42,6 +42,10 @@ def test_a_run_writes_all_documented_files(run):
     assert TrainParameters.load(run / 'train.yaml').plain() == expected.plain()
 
 
+def test_the_shipped_parameters_are_the_defaults():
+    assert TrainParameters.load().plain() == TrainParameters().plain()
+
+
 def test_the_policy_of_a_run_flies(run):
     controller = PolicyController(ROBOT, PolicyParameters(policy=str(run / 'policy.onnx')))
     assert controller.contract.training['seed'] == 5
