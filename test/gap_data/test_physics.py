@@ -1,8 +1,4 @@
-"""
-The robot of the blind flights against closed forms, and its tracking of references.
-
-The engine of the package finds no effect in its flights without one, see test_bag_engine.
-"""
+"""The robot of the blind flights against closed forms, and its tracking of references."""
 
 from gap_data.courses import RATE
 from gap_data.flight import fly, LostFlight
@@ -12,12 +8,14 @@ from gap_data.truth import Robot
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 
-def plant(hidden=None, *, multibody=False, **more):
+def plant(hidden=None, *, multibody=False, thrust=None, tilt=0.0, **more):
     robot = Robot()
-    return Plant(robot, hidden or Hidden(), multibody=multibody, position=(0, 0, 2), quaternion=(
-        1, 0, 0, 0), tilt=(0, 0, 0, 0), thrust=[robot.hover_thrust] * 4, **more)
+    thrust = [robot.hover_thrust] * 4 if thrust is None else thrust
+    return Plant(robot, hidden or Hidden(), multibody=multibody, position=(0, 0, 2),
+                 quaternion=(1, 0, 0, 0), tilt=[tilt] * 4, thrust=thrust, **more)
 
 
 def test_multibody_totals_equal_those_of_the_interface():
@@ -49,6 +47,20 @@ def test_the_step_response_of_a_servo_agrees_with_its_equation():
     t = 0.001 * np.arange(1, 81)
     closed = step * (1 - np.exp(-decay * t) * (np.cos(wd * t) + decay / wd * np.sin(wd * t)))
     assert angles == pytest.approx(closed, abs=2e-6)
+
+
+def test_thrust_acts_along_the_tilted_rotor():
+    angle = 0.4
+    for rotor, yaw in enumerate(np.radians([45, 135, 225, -45])):
+        thrust = np.eye(4)[rotor] * 6.0
+        body = plant(thrust=thrust, tilt=angle)
+        body.command(0.0, [angle] * 4, thrust)
+        body.step()
+        axis = Rotation.from_rotvec(angle * np.array([np.cos(yaw), np.sin(yaw), 0])).apply(
+            [0, 0, 6.0])
+        torque = np.cross(body.robot.positions[rotor], axis) \
+            - body.robot.spin[rotor] * 0.0165 * axis
+        assert body.data.ctrl[:6] == pytest.approx([*axis, *torque], abs=1e-9)
 
 
 def test_a_command_acts_after_its_age_and_delay():
