@@ -47,6 +47,7 @@ def test_recorder_reference_controller_and_estimator_are_lost_one_after_another(
 
 
 def loses_one_node_after_another(graph, witness, bag):
+    assert witness.stays_in_the_air(1.0)
     killed_at = witness.truth.stamp
     graph.kill('recorder_node')
     assert witness.stays_in_the_air(0.5)
