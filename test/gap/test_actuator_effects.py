@@ -56,8 +56,6 @@ CASES = [
      0.02),
     ({'speed': 4.0}, {'joint_velocity_limit.velocity_limit': 4.0},
      {'joint_velocity_limit.velocity_limit': np.log(0.5)}, 0.1),
-    ({'effort': 0.08}, {'joint_torque_limit.effort_limit': 0.08},
-     {'joint_torque_limit.effort_limit': np.log(0.04)}, 0.004),
     ({'coulomb': 0.008, 'stiction': 0.008}, {'joint_friction.coulomb': 0.008},
      {f'joint_friction.{name}': 0.006 for name in ('coulomb', 'stiction')}, 0.0012),
     ({'bend': 0.002}, {'joint_deflection.deflection_per_newton': 0.002}, None, 1e-4)]
@@ -198,7 +196,7 @@ def engine_of(made, starts):
                   curved=frozenset({*starts, *made.tangents}))
 
 
-@pytest.mark.parametrize(('factor', 'rounds'), [(0.1, 6), (0.3, 6), (0.7, 6), (0.5, 1)])
+@pytest.mark.parametrize(('factor', 'rounds'), [(0.1, 6), (0.7, 6), (0.5, 1)])
 def test_a_torque_limit_keeps_its_value_when_it_is_linearised_again(factor, rounds, monkeypatch):
     # with one round, the search ends far from where the limit acts
     monkeypatch.setattr(engine_module, 'MOST_ROUNDS', rounds)

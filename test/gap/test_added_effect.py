@@ -5,7 +5,6 @@ from pathlib import Path
 import re
 
 from flights import model, Motion, ROBOT, solved
-from flown_once import FIVE_POSES
 import numpy as np
 import pytest
 from rich.console import Console
@@ -83,19 +82,6 @@ def test_an_effect_without_a_treatment_acts_as_the_file_has_it(monkeypatch):
     assert np.abs(treated - none).max() > 0.01
 
 
-def test_a_flight_with_the_added_effect_names_it_with_its_size(tmp_path):
-    hot = {HEAT: {'loss_per_kelvin': 0.004, 'temperature': 50.0}}
-    beetle_omni_ros.simulate('hover', FIVE_POSES, seed=3, bag=tmp_path / 'flight', plant=replace(
-        beetle_omni_ros.robot(), effects=hot))
-    file = tmp_path / 'no_loss.yaml'
-    file.write_text(f'extends: robot.yaml\neffects: {{{HEAT}: {{loss_per_kelvin: 0.0, '
-                    'temperature: 50.0}}\n')
-    result = gap_results([tmp_path / 'flight'], robot=file, console=Console(quiet=True))
-    assert [effect['names'] for effect in result['effects']] == [[HEAT]]
-    low, high = result['effects'][0]['parameters']['loss_per_kelvin']['interval']
-    assert low < 0.004 < high < 0.005
-
-
 def test_a_wrong_time_constant_of_a_state_is_named_with_the_true_one(tmp_path):
     def file(name, time_constant):
         path = tmp_path / f'{name}.yaml'
@@ -104,9 +90,8 @@ def test_a_wrong_time_constant_of_a_state_is_named_with_the_true_one(tmp_path):
         return path
     beetle_omni_ros.simulate('nmpc', 'random6', seed=4, bag=tmp_path / 'flight',
                              plant=file('plant', 10.0))
-    for name, time_constant in (('right', 10.0), ('wrong', 60.0)):
-        result = gap_results([tmp_path / 'flight'], robot=file(name, time_constant),
-                             console=Console(quiet=True))
-        assert [effect['names'] for effect in result['effects']] == [[WARMING]] * (name == 'wrong')
+    result = gap_results([tmp_path / 'flight'], robot=file('wrong', 60.0),
+                         console=Console(quiet=True))
+    assert [effect['names'] for effect in result['effects']] == [[WARMING]]
     low, high = result['effects'][0]['parameters']['time_constant']['interval']
     assert low < 10.0 < high < 25.0

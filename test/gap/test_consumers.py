@@ -175,5 +175,17 @@ def test_a_consumer_applies_an_effect_or_states_why_not(consumer, name):
 
 
 @pytest.mark.parametrize('name', CATALOGUE)
+def test_a_fit_has_a_complete_and_consistent_treatment_of_each_effect(name):
+    treatment = TREATMENTS[name]
+    assert list(treatment.sizes) == CATALOGUE[name].numbers
+    assert treatment.excited_by and treatment.separated_by
+    assert all(other in CATALOGUE for other in treatment.confused_with)
+    assert set(treatment.channels) <= set('BAWJ') and treatment.channels
+    assert all(len(start) == len(treatment.sizes) for start in treatment.starts)
+    assert all(size.step > 0 and size.typical > size.smallest > 0
+               for size in treatment.sizes.values())
+
+
+@pytest.mark.parametrize('name', CATALOGUE)
 def test_the_gap_finder_applies_every_effect(name):
     assert gap(name) != bool(ignored('gap', name))
