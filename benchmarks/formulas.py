@@ -305,8 +305,9 @@ def summary(rows):
     own = [row for row in rows if 'failure' not in row]
     laws = [row for row in own if row['formula']]
     return {'cases': len(rows), 'failures': len(rows) - len(own), 'formulas': len(laws),
-            'rediscovered': sum(bool(row['correlation'] >= LIKE and row['closure'] >= CLOSED)
-                                for row in laws),
+            **{f'rediscovered{which}': sum(bool(
+                row[f'correlation{which}'] >= LIKE and row['closure'] >= CLOSED) for row in laws)
+                for which in ('', '_all')},
             'baseline_formulas': sum(bool(row['formula_baseline']) for row in own),
             'baseline_correlated': sum(row['correlation_baseline'] >= LIKE for row in own)}
 
