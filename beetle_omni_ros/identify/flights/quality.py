@@ -67,7 +67,8 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
     Tolerances of the robot are as fitted, so that they count in none of the three: fitted again,
     they would explain the noise of these flights. The last fit adapts the named entries and the
     discrepancy to these flights. Their own deviations are fitted within their priors in each case.
-    The noise is that of the fitted flights.
+    The noise is that of the fitted flights. A deviation counts by its size over its prior, too, so
+    that no flight takes a named effect as its own; sensors that are named are those of all flights.
     """
     generic = np.zeros(len(engine.names) - engine.known)
     theta = np.concatenate([solution.theta[:engine.known], generic])
@@ -76,9 +77,9 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
     noise, total, count = pooled(solution.spectra), np.zeros(3), 0
     less = theta.copy()
     less[engine.indices(named)] = 0.0
-    own = engine.flight.copy()
+    own, of_all = engine.flight.copy(), set(engine.indices(named))
     for _, key, column in engine.repeats:
-        if not fitted:      # sensors of flights that judge may differ from those of the others
+        if not fitted and key not in of_all:    # sensors of flights that judge may be others
             own[key] = engine.typical[column]
     every = own.copy()
     every[engine.known:] = engine.narrow[engine.known:]
@@ -86,17 +87,18 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
     for each in spectra:
         each.noise = noise
         g, h = (part.sum(axis=(0, 1)) for part in each.grams())
-        r2 = each.power()
+        r2, noise_of_own = each.power(), 0.0
         for k, (start, free) in enumerate((
                 (less, own), (theta, own), (theta, every))):
             at = np.flatnonzero(free > 0)
             left, info = h - g @ start, g[np.ix_(at, at)]
             inner = np.linalg.inv(info + np.diag(free[at]**-2))
             move = inner @ left[at]
-            total[k] += r2 - 2 * h @ start + start @ g @ start - 2 * left[at] @ move \
-                + move @ info @ move
-            # what a fit explains of white noise alone
-            total[k] += np.trace(inner @ info)
+            total[k] += r2 - 2 * h @ start + start @ g @ start - left[at] @ move
+            # what the wider priors explain of white noise alone
+            explained = float(np.trace(inner @ info))
+            noise_of_own = noise_of_own if k else explained
+            total[k] += explained - noise_of_own
         count += each.size
     total = np.maximum(total, 1e-9 * count)
     # chi2 that is left of the difference, if the flights show a difference at all
