@@ -301,6 +301,14 @@ def write_hovering(path, seed, push, seconds=24.0, step=0.002):
     return path
 
 
+@pytest.mark.parametrize('seed', [135, 155])
+def test_the_answer_to_a_wake_is_no_effect_of_the_robot(tmp_path, seed):
+    form = tmp_path / 'hovering.yaml'
+    form.write_text(HOVERING)
+    flights = [write_hovering(tmp_path / f'{k}.csv', seed + k, push=0.3) for k in range(3)]
+    assert not named(gap_of(flights, str(form)))
+
+
 def test_a_thrust_that_the_rotors_cannot_deliver_does_not_count(tmp_path):
     form = tmp_path / 'hovering.yaml'
     form.write_text(HOVERING + 'voltage: {columns: [fx], unit: V}\n')
