@@ -265,6 +265,13 @@ def test_a_wind_of_a_fifth_of_the_weight_is_not_taken_for_markers_that_are_turne
     assert np.allclose(force, [0.05, -0.03, 0.0], atol=0.004)
 
 
+def test_a_drag_that_too_few_blocks_show_is_no_unknown_force(tmp_path):
+    result = gap_of([write_flight(tmp_path / 'short.csv', 1, drag=0.03, seconds=22)])
+    assert result['verdict'] == 'not_decidable' and not result['effects']
+    assert 'rotor drag would explain' in result['reason']
+    assert named(gap_of([write_flight(tmp_path / 'long.csv', 1, drag=0.03)])) == {'rotor_drag'}
+
+
 HOVERING = """
 time: {columns: [t], unit: s}
 position: {columns: [px, py, pz], unit: m}
