@@ -52,6 +52,16 @@ def test_a_specific_force_in_world_is_turned_by_the_attitude_of_its_row(tmp_path
         declared(tmp_path, FORMAT.replace('unit: g,', 'unit: g, frame: sky,'))
 
 
+def test_the_header_may_be_a_comment_as_numpy_writes_it(tmp_path):
+    path, numbers = tmp_path / 'flight.csv', np.arange(20)[:, None] * [10, *range(11)]
+    np.savetxt(path, numbers, delimiter=',', header='made by numpy\n' + HEADER.strip())
+    assert np.allclose(read_flight(path, declared(tmp_path)).values['duty'][3], [
+        21 / 65535, 24 / 65535, 27 / 65535, 30 / 65535])
+    np.savetxt(path, numbers, delimiter=',', header='made by numpy')
+    with pytest.raises(ParameterError, match='the header is missing'):
+        read_flight(path, declared(tmp_path))
+
+
 def test_a_single_column_needs_no_list_and_the_unit_1_no_quotes(tmp_path):
     form = declared(tmp_path, FORMAT.replace('[ms]', 'ms') + 'voltage: {columns: u, unit: mV}\n')
     assert form.signals['time'].columns == ('ms',) and form.signals['voltage'].columns == ('u',)
