@@ -418,6 +418,16 @@ def test_flights_on_the_ground_and_other_channels_are_told_by_name(tmp_path):
         gap_of([good, blind])
 
 
+def test_hops_that_no_filter_can_use_are_told_and_no_error(tmp_path):
+    path = write_flight(tmp_path / 'hops.csv', 1, seconds=20)
+    cells = np.loadtxt(path, delimiter=',', skiprows=1)
+    cells[cells[:, 0] % 1.4 > 0.8, 14:18] = np.nan      # 0.5 s after a gap do not count
+    np.savetxt(path, cells, delimiter=',', header=HEADER, comments='')
+    path.write_text(path.read_text().replace('nan', ''))
+    result = gap_of([path])
+    assert result['verdict'] == 'bad_data' and 'has no block of commands' in result['reason']
+
+
 def test_duty_needs_a_robot_with_a_motor_map(tmp_path):
     flight = write_flight(tmp_path / 'a.csv', 1, seconds=5)
     with pytest.raises(ParameterError, match="'rotors.motor' is missing"):

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.flights.body import BodyModel
 from beetle_omni_ros.identify.flights.keys import Key, names_of
-from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear
+from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear, warm
 from beetle_omni_ros.identify.recording.series import (
     aligned,
     along,
@@ -246,7 +246,8 @@ class TableFlight:
     @property
     def usable(self) -> bool:
         """Whether it has a block of samples in the air."""
-        return bool(self.channels) and len(blocks_of(self.mask, self.period)) > 0
+        return bool(self.channels) and len(blocks_of(
+            warm(self.mask, self.period), self.period)) > 0
 
     def without(self, groups: tuple[str, ...], reason: str) -> None:
         """Leave groups of channels out, for this ``reason``."""
