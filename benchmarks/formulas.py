@@ -29,12 +29,14 @@ from beetle_omni_ros.identify.recording import bag, flight, parameters
 from beetle_omni_ros.model import dynamics, effects, formula, terms
 from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import mass_properties, RobotParameters
+from beetle_omni_ros.model.parts import ThrustMap
 from beetle_omni_ros.model.schema import ParameterError
 
 LIKE, CLOSED = 0.95, 0.8    # least correlation and closure of a law that is rediscovered
 LOW = 0.3                   # [m] the flight above counts
 GAP = parameters.GapParameters.load()
 UNDISTURBED, TRIES = 'undisturbed', 5   # draws of an effect until no flight is lost
+OF_ONE = ' of one joint'    # end of the name of an effect that only one joint has
 X, Y, Z = (ca.DM(row) for row in np.eye(3))
 STATES = ('position', 'velocity', 'quaternion', 'angular_velocity', 'tilt', 'tilt_velocity',
           'thrust', 'stamp')     # true ones
@@ -101,7 +103,8 @@ KINDS = {'left_out': [
 
 def drawn(name, robot, rng):
     """Parameters of an effect of 1 to 2 typical sizes, of a random sign or direction."""
-    factor, entry, made = rng.uniform(1, 2), effects.CATALOGUE[name], {}
+    factor, name, one = rng.uniform(1, 2), name.removesuffix(OF_ONE), name.endswith(OF_ONE)
+    entry, made = effects.CATALOGUE[name], {}
     if name in KINDS['outside']:
         return {'size': factor * (FORCES | GAINS)[name][0]}
     keys = [key for key in all_keys(robot).values() if key.effect == name and not key.form]
@@ -115,6 +118,10 @@ def drawn(name, robot, rng):
         spec, more = entry.parameters[key.parameter], factor * part * key.typical
         made.setdefault(key.parameter, []).append(float(key.value(
             more if spec.low <= key.value(more) <= spec.high else -more)))
+    if one:
+        joint, base = rng.integers(4), {key.parameter: key.base for key in keys}
+        made = {key: [each[0] if k == joint else base[key] for k in range(4)]
+                for key, each in made.items()}
     return {key: tuple(each) if len(each) > 1 else each[0] for key, each in made.items()}
 
 
@@ -134,7 +141,8 @@ def hidden(names, robot, controller, tasks, rng, folder):
 
     """
     for lost in range(TRIES):
-        plant = replace(robot, effects={name: drawn(name, robot, rng) for name in names})
+        plant = replace(robot, effects={
+            name.removesuffix(OF_ONE): drawn(name, robot, rng) for name in names})
         paths = [folder / f'{lost}_{k}' for k in range(len(tasks))]
         try:
             mass_properties(plant)
@@ -161,8 +169,7 @@ def fly(controller, robot, plant, task, seed, path):
         sent = loop.recording().command
     *states, tilt_rate, real, t, voltage = map(np.array, zip(*rows, strict=True))
     ratio, step, high = voltage / plant.battery.full_voltage, simulator.tick, states[0][:, 2] > LOW
-    points = sorted((row.voltage, row.thrust_max) for row in robot.rotors.map)
-    most = np.interp(ratio * robot.battery.full_voltage, *zip(*points, strict=True))
+    most = ThrustMap(robot.rotors).thrust_limit_below(ratio * robot.battery.full_voltage)
 
     def flown(other=None):
         """States, name -> (N, width); the thrusts are answers to the recorded commands."""
@@ -212,7 +219,7 @@ def sparse(paths, robot):
     from pysindy import STLSQ
     library, weight, x, y = formula.library(), robot.mass * robot.gravity, [], []
     known = with_formula(robot, dict.fromkeys(library, 0.0))
-    keys = {**all_keys(known), **extra_keys()}
+    keys = {**all_keys(known), **extra_keys(known)}
     model = body.BodyModel(known, keys, body.tilting_modules(robot))
     sizes = np.array([formula.size_of(term, weight, ARM) for term in library])
     units = np.array([robot.mass] * 3 + list(robot.inertia / ARM)) / (formula.SHARE * weight)
@@ -298,8 +305,9 @@ def summary(rows):
     own = [row for row in rows if 'failure' not in row]
     laws = [row for row in own if row['formula']]
     return {'cases': len(rows), 'failures': len(rows) - len(own), 'formulas': len(laws),
-            'rediscovered': sum(bool(row['correlation'] >= LIKE and row['closure'] >= CLOSED)
-                                for row in laws),
+            **{f'rediscovered{which}': sum(bool(
+                row[f'correlation{which}'] >= LIKE and row['closure'] >= CLOSED) for row in laws)
+                for which in ('', '_all')},
             'baseline_formulas': sum(bool(row['formula_baseline']) for row in own),
             'baseline_correlated': sum(row['correlation_baseline'] >= LIKE for row in own)}
 

@@ -1,7 +1,7 @@
 """
 Effects hidden in flights of the own simulator: ``python benchmarks/gap_own.py --seed 0``.
 
-Of 62 cases, 38 hide one entry of the catalogue each, 16 hide two and 8 none, with the sizes of
+Of 65 cases, 41 hide one entry of the catalogue each, 16 hide two and 8 none, with the sizes of
 :func:`formulas.drawn`. A drawn controller flies drawn tasks, `gap` gets the bags, and its answer
 is judged as in ``gap_campaign.py``. Unlike there, simulator and model have the same laws. The same
 command continues a run. A case depends on its number and the seed alone.
@@ -13,7 +13,7 @@ from functools import partial
 from itertools import count, islice
 from pathlib import Path
 
-from formulas import attempted, described, hidden, swept
+from formulas import attempted, described, hidden, OF_ONE, swept
 from gap_data.campaign import read_answer
 from gap_data.judge import judge
 from gap_data.score import criteria, LEGEND, table
@@ -28,6 +28,8 @@ from beetle_omni_ros.model.files import write_json
 from beetle_omni_ros.model.parameters import RobotParameters
 
 ENTRIES = list(dict.fromkeys(key.effect for key in all_keys(RobotParameters.load()).values()))
+ENTRIES += [name + OF_ONE for name in ENTRIES
+            if any(parameter.of_each for parameter in CATALOGUE[name].parameters.values())]
 PAIRS, NONE = 16, 8     # cases beside one of each entry
 KINDS = 'singles', 'pairs', 'none'
 TASKS = [['random5'] * 3, ['random5', 'lemniscate', 'random5'], ['random7'] * 2]
@@ -49,11 +51,11 @@ def labels(truth):
     """Hidden effects as :func:`gap_data.judge.judge` expects them, one of four with its place."""
     made = []
     for name, values in truth.items():
-        of, place = CATALOGUE[name].each, {}
-        if of:
-            (key, value), = values.items()
-            k = int(np.argmax(np.not_equal(value, CATALOGUE[name].parameters[key].neutral)))
-            values, place = {key: value[k]}, {of: k + 1}
+        of, place, first = CATALOGUE[name].each, {}, next(iter(values))
+        if of or CATALOGUE[name].parameters[first].of_each and np.ndim(values[first]):
+            k = int(np.argmax(np.abs(values[first] - np.median(values[first]))))
+            values = {key: value[k] for key, value in values.items() if np.ndim(value)}
+            place = {of or 'joint': k + 1}
         made.append({'name': name, **place, 'parameters': values})
     return made
 
@@ -95,7 +97,7 @@ def main():
     """Examine the cases and print their score."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--cases', type=int, default=62)
+    parser.add_argument('--cases', type=int, default=65)
     parser.add_argument('--kinds', default=','.join(KINDS), help='only these')
     parser.add_argument('--case', type=int, help='only the one with this number, in full')
     parser.add_argument('--jobs', type=int, help='at a time (every core)')

@@ -13,8 +13,8 @@ TWO_POSES = [[0.8, 0.4, 1.2, 40, 20, 90], [-0.6, 0.8, 0.9, -30, 35, -120]]
 THREE_POSES = [[-0.7, 0.5, 1.0, -90, 10, -60], [0.9, -0.6, 1.3, 60, 50, 100],
                [0, 0.4, 1.1, 170, 0, 20]]
 # name -> poses, wind, options
-FIVE_POSES = TWO_POSES + THREE_POSES
-FLIGHTS = {'windy_0': (FIVE_POSES, WIND, {'seed': 0}), 'windy_1': (THREE_POSES, WIND, {'seed': 1}),
+FLIGHTS = {'windy_0': (TWO_POSES + THREE_POSES, WIND, {'seed': 0}),
+           'windy_1': (THREE_POSES, WIND, {'seed': 1}),
            'calm': (TWO_POSES, None, {'seed': 0}),
            'published': (THREE_POSES, None, {'seed': 5, 'conditions': 'published'})}
 folder: Path | None = None      # set by conftest.py, the same for all workers

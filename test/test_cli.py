@@ -28,6 +28,7 @@ def bag(tmp_path_factory):
 
 def refused(capsys, *arguments):
     """Run the command, expect status 2 and one line on standard error; return the line."""
+    capsys.readouterr()
     assert cli.main([str(a) for a in arguments]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1, lines

@@ -49,14 +49,8 @@ def test_an_own_controller_flies_beside_the_nmpc(run, poses):
     assert 'pose_controller' in printed
 
 
-def test_an_own_trajectory_is_followed_by_both_controllers():
-    done = subprocess.run(
-        [sys.executable, 'examples/own_trajectory.py', '2'], cwd=ROOT, capture_output=True,
-        text=True, timeout=250, check=False,
-        env={'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1', 'PATH': '/usr/bin:/bin',
-             'HOME': str(Path.home())})
-    assert done.returncode == 0, done.stderr
-    printed = done.stdout
+def test_an_own_trajectory_is_followed_by_both_controllers(run):
+    printed = run('own_trajectory.py', 2)
     errors = dict(re.findall(r'^(nmpc|rl): ([\d.]+) mm', printed, re.MULTILINE))
     assert {'nmpc', 'rl'} == set(errors) and max(map(float, errors.values())) < 100
     assert 'Trajectory tracking' in printed and 'poses reached' not in printed

@@ -1,6 +1,5 @@
 """The metadata for colcon, pip, ros2 and rosdep are complete and consistent."""
 
-import ast
 from importlib import import_module
 import importlib.util
 from pathlib import Path
@@ -10,6 +9,7 @@ import sys
 import xml.etree.ElementTree as ElementTree
 
 import pytest
+from test_imports import imports
 
 import beetle_omni_ros
 from beetle_omni_ros import start
@@ -40,13 +40,8 @@ def setup_arguments():
 
 def third_party_imports():
     """Top-level modules that the package imports, without its own and Python's."""
-    found = set()
-    for path in (ROOT / PACKAGE).rglob('*.py'):
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
-            if isinstance(node, ast.Import):
-                found |= {alias.name.split('.')[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom):
-                found.add(node.module.split('.')[0])
+    found = {name.split('.')[0] for path in (ROOT / PACKAGE).rglob('*.py')
+             for name, _ in imports(path)}
     return sorted(found - set(sys.stdlib_module_names) - {PACKAGE})
 
 

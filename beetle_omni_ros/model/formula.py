@@ -77,6 +77,7 @@ SCALARS = {
     'upright': Factor(ONE, 0.7, 'n_Z', lambda q, i: ca.dot(q.world[2], q.normals[i])),
     'ground': Factor(ONE, 0.1, '(0.25 m/h)^2', lambda q, i: (NEAR / ca.fmax(ca.dot(
         q.world[2], q.position + q.terms.rotor_positions[i]), LEAST_HEIGHT))**2),
+    'voltage': Factor(ONE, 0.1, '(V/V_0 - 1)', lambda q, i: q.terms.voltage_ratio - 1),
     'spin': Factor(ONE, 1.0, 'spin', lambda q, i: q.terms.spin[i]),
     **{f'rotor_{k + 1}': Factor(ONE, 0.25, f'[rotor {k + 1}]', lambda q, i, k=k: float(i == k))
        for k in range(4)}}
@@ -142,9 +143,11 @@ LIBRARY = (
     'thrust: {thrust|rotor_speed|thrust_rate|axial_speed|in_plane_speed|tilt_rate}',
     'thrust: {axial_speed * axial_speed|in_plane_speed * in_plane_speed}',
     'thrust: {rotor_speed|thrust}{axial_speed|in_plane_speed|tilt_rate|tilt_sine|upright|ground}',
+    'thrust: thrust * voltage',
     'thrust: thrust{tilt_sine * tilt_sine|upright * upright|ground * upright|ground * ground}',
     'thrust: thrust{in_plane_speed * in_plane_speed|rotor_1|rotor_2|rotor_3|rotor_4}')
-OF_HEIGHT = 'ground', 'position'
+# Factor of a quantity of the terms that may be unknown -> that quantity.
+MEASURED = {'ground': 'position', 'position': 'position', 'voltage': 'voltage_ratio'}
 OF_ONE = 'rotor_1', 'rotor_2', 'rotor_3', 'rotor_4'
 OF_TILT = 'tilt_rate', 'tilt_acceleration', 'tilt_sine', 'turning', 'arm', 'side', 'normal'
 
@@ -189,11 +192,11 @@ def size_of(term: str, weight: float, arm: float) -> float:
 
 
 def apply(terms: Terms, expressions: tuple[str, ...], coefficients: tuple) -> None:
-    """Add a formula to the terms of the body's equations; without position, less its terms."""
+    """Add a formula to the terms of the body's equations, but for those of unknown quantities."""
     q, thrust = Quantities(terms), [0] * 4
     for law, coefficient in zip(expressions, coefficients, strict=True):
         target, names, factors = parsed(law)
-        if terms.position is None and set(OF_HEIGHT) & set(names):
+        if any(getattr(terms, MEASURED[name]) is None for name in names if name in MEASURED):
             continue
         for i in range(4 if TARGETS[target][3] else 1):
             value = coefficient

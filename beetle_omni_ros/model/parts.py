@@ -184,11 +184,13 @@ class ThrustMap:
         return np.interp(voltage, self.voltages, self.thrust_limits)
 
     def thrust_limit_below(self, voltage):
-        """As :meth:`thrust_limit` [N], but extrapolated below the lowest row, at least zero."""
+        """As :meth:`thrust_limit` [N], but extrapolated below the lowest of two or more rows."""
+        known = self.thrust_limit(voltage)
+        if len(self.voltages) < 2:
+            return known
         (v, w), (f, g) = self.voltages[:2], self.thrust_limits[:2]
         low = f + (voltage - v) * (g - f) / (w - v)
-        return np.maximum(0.0, np.where(voltage < v, low, np.interp(
-            voltage, self.voltages, self.thrust_limits)))
+        return np.maximum(0.0, np.where(voltage < v, low, known))
 
     def saturated(self, thrust, voltage) -> np.ndarray:
         """Whether ``thrust`` [N] exceeds the limit at ``voltage`` [V]; shapes broadcast."""

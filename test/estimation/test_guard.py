@@ -17,7 +17,7 @@ NAN, INF, HUGE = np.nan, np.inf, 1e200
 @pytest.fixture(scope='module')
 def flown():
     """A flight, a filter in the middle of it, and one after it."""
-    flight = fly(1, 4.0)
+    flight = fly(1, 2.5)
     middle = run(new_ekf(), flight, until=1.5)
     assert middle.status == 'tracking' and not middle.rejected
     return flight, middle, run(new_ekf(), flight)

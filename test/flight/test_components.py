@@ -6,6 +6,7 @@ import re
 from desk import Desk
 import numpy as np
 import pytest
+from test_host import Own
 
 from beetle_omni_ros.bags.log import Recorder
 from beetle_omni_ros.bags.messages import Wrench
@@ -123,22 +124,6 @@ def test_the_estimator_publishes_only_valid_estimates_with_positive_covariances(
 
 # --- controllers --------------------------------------------------------------------------------
 
-class Follower:
-    """A controller that records its inputs."""
-
-    period, reach = 0.01, np.inf
-
-    def __init__(self):
-        self.received, self.resets = [], 0
-
-    def reset(self):
-        self.resets += 1
-
-    def step(self, state, target):
-        self.received.append((state, target))
-        return Command(state.stamp, np.zeros(4), np.full(4, 7.5))
-
-
 def fly(desk, stamps):
     for desk.time in np.atleast_1d(stamps):
         desk.component.feed('odom', BodyState(desk.time, np.array([0, 0, 1.0]), np.zeros(3), LEVEL,
@@ -152,7 +137,7 @@ def aim(desk, x, stamp, z=1.0, published=np.nan):
 
 @pytest.fixture
 def follower():
-    desk = Desk(ControllerComponent('nmpc', Follower(), ROBOT), 99.9)
+    desk = Desk(ControllerComponent('nmpc', Own(), ROBOT), 99.9)
     fly(desk, 99.9 + 0.005 * np.arange(20))
     assert not desk.sent        # no joint angles yet
     desk.component.feed('joint_states', JointReading(desk.time, np.zeros(4), np.zeros(4)))
@@ -165,7 +150,7 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(follower):
     stamps = 101 + 0.005 * np.arange(200)
     fly(follower, stamps)
     assert np.allclose(follower.stamps('nmpc/command'), stamps[::2])
-    state, _ = follower.component.stepper.controller.received[-1]
+    state = follower.component.stepper.controller.states[-1]
     assert state.tilt == pytest.approx(health.true(np.zeros(4)))
     fly(follower, [95.0, 95.005, 95.01])    # the clock was set back, and the new time is used
     assert len(follower.stamps('nmpc/command')) == 102
@@ -174,7 +159,7 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(follower):
 def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets(follower):
     def target():
         fly(follower, follower.time + 1.0)
-        return follower.component.stepper.controller.received[-1][1]
+        return follower.component.stepper.controller.targets[-1]
 
     for stamp, x in ((50.0, 1.0), (60.0, 2.0), (50.0, 3.0)):
         aim(follower, x, stamp)
@@ -189,7 +174,7 @@ def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets
 
 def test_a_bad_target_is_refused_with_its_reason_and_the_old_one_stays(follower):
     stepper = follower.component.stepper
-    stepper.controller.reach, follower.simulated = 6.5, False
+    follower.simulated = False
     fly(follower, 100.0)
     aim(follower, 0.0, 100.0, published=100.0)
     first = stepper.target

@@ -52,17 +52,6 @@ def flown(poses, tmp_path_factory):
                     json_path=folder / 'result.json'), folder
 
 
-def without_times(results):
-    return {name: {key: value for key, value in result.items() if key != 'compute_ms'}
-            for name, result in results.items()}
-
-
-def test_a_seed_gives_the_same_numbers_and_another_seed_others(poses, flown):
-    first, (again, other) = flown[0], (evaluate(poses, ('hover',), seed=seed) for seed in (3, 4))
-    assert json.dumps(without_times(first)['hover']) == json.dumps(without_times(again)['hover'])
-    assert first['hover']['mean'] != other['hover']['mean']
-
-
 def test_the_json_has_the_keys_of_the_interface(flown):
     result = json.loads((flown[1] / 'result.json').read_text())
     assert {'task', 'conditions', 'seed', 'robot', 'version'} <= set(result['meta'])
@@ -190,10 +179,10 @@ def test_faults_of_a_file_act_and_are_listed_in_the_results(tmp_path):
     task = make_task('random1')
     task = replace(task, segments=(replace(task.segments[0], duration=3.0),))
     path = tmp_path / 'faults.yaml'
-    path.write_text('faults: {two: {strike: [{kind: rotor_stops, at: 1.0, rotor: 2}, '
+    path.write_text('faults: {two: {strike: [{kind: mocap_lost, at: 1.0, duration: 0.1}, '
                     '{kind: controller_silent}]}}')
     results = evaluate(task, ('hover',), faults=path, bag=tmp_path / 'bag')
-    listed = ['rotor_stops at=1 rotor=2', 'controller_silent at=0']
+    listed = ['mocap_lost at=1 duration=0.1', 'controller_silent at=0']
     assert results['meta']['faults'] == listed
     log = read_bag(tmp_path / 'bag')
     assert log.meta['faults'] == listed

@@ -59,11 +59,8 @@ def test_a_landing_and_a_healthy_flight():
     assert healthy['state'] == 'disarmed' and healthy['alarms'] == [] and healthy['good']
 
 
-@pytest.mark.parametrize(('case', 'start'), [
-    ('mocap_lost', 'upside_down'), ('rotor_1_stops', 'moving')])
-def test_the_robot_lands_in_spite_of_a_fault(case, start):
-    landed = flown(case, start, replace(PLAN, hover_time=1.0, turn_time=4.5, jitter=0.2,
-                                        watch_time=3.0))
+def test_the_robot_lands_with_a_stopped_rotor_on_the_move():
+    landed = flown('rotor_1_stops', 'moving', replace(PLAN, jitter=0.2, watch_time=3.0))
     assert landed['good'] and landed['state'] == 'disarmed' and not landed['broken'], landed
 
 

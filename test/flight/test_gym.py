@@ -36,13 +36,11 @@ def test_it_keeps_the_rules_of_gymnasium(env):
                                                             'attitude_error_rad'}
 
 
-def test_the_shipped_policy_reaches_a_pose_and_repeats_by_the_seed(env):
+def test_the_shipped_policy_reaches_a_pose(env):
     network = PolicyNetwork(share_path('policies/rl.onnx'), RobotParameters.load())
-    first, fell, info = flown(env, lambda seen: network(seen.tolist()), [0.3, 0, 1.2, 40, 0, 0])
-    again, *_ = flown(env, lambda seen: network(seen.tolist()), [0.3, 0, 1.2, 40, 0, 0])
-    assert not fell and len(first) == 600
+    rewards, fell, info = flown(env, lambda seen: network(seen.tolist()), [0.3, 0, 1.2, 40, 0, 0])
+    assert not fell and len(rewards) == 600
     assert info['position_error_m'] < 0.03 and info['attitude_error_rad'] < 0.03
-    np.testing.assert_array_equal(first, again)
 
 
 def test_the_supervisor_ends_an_episode_of_full_thrust(env):

@@ -51,6 +51,7 @@ def test_workers_give_the_numbers_of_this_process_and_are_flown_once(poses, tmp_
     both = sweep(flights, store=store, jobs=1)
     assert without_times(first[0]) == without_times(both[0])
     assert both[1]['metrics']['poses'] and not both[1]['failure']
+    assert both[0]['metrics']['mean'] != both[1]['metrics']['mean']     # of another seed
 
 
 def test_a_stored_flight_is_reused_for_equal_inputs_only(poses, tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ from beetle_omni_ros.model.parameters import RobotParameters
 
 ROBOT = replace(RobotParameters.load(), multibody=None)
 P = GapParameters.load()
-KEYS = {**all_keys(ROBOT), **extra_keys()}
+KEYS = {**all_keys(ROBOT), **extra_keys(ROBOT)}
 BODY = BodyModel(ROBOT, KEYS, (0.0, 0.0))
 STEP = 0.005
 

@@ -9,7 +9,7 @@ import pytest
 
 from beetle_omni_ros.identify.flights import engine as engine_module
 from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.keys import Entry, Prior
+from beetle_omni_ros.identify.flights.keys import Entry, of_start, Prior
 from beetle_omni_ros.identify.flights.quality import errors
 from beetle_omni_ros.identify.flights.results import effect_of
 from beetle_omni_ros.identify.flights.servo import (
@@ -20,7 +20,7 @@ from beetle_omni_ros.identify.flights.servo import (
     Windows,
 )
 from beetle_omni_ros.identify.flights.signals import Signals
-from beetle_omni_ros.identify.flights.verdict import first_point
+from beetle_omni_ros.identify.flights.verdict import first_point, starts_in
 from beetle_omni_ros.identify.recording.bag import COMMAND, JOINTS
 from beetle_omni_ros.model.parameters import RobotParameters
 
@@ -56,8 +56,6 @@ CASES = [
      0.02),
     ({'speed': 4.0}, {'joint_velocity_limit.velocity_limit': 4.0},
      {'joint_velocity_limit.velocity_limit': np.log(0.5)}, 0.1),
-    ({'effort': 0.08}, {'joint_torque_limit.effort_limit': 0.08},
-     {'joint_torque_limit.effort_limit': np.log(0.04)}, 0.004),
     ({'coulomb': 0.008, 'stiction': 0.008}, {'joint_friction.coulomb': 0.008},
      {f'joint_friction.{name}': 0.006 for name in ('coulomb', 'stiction')}, 0.0012),
     ({'bend': 0.002}, {'joint_deflection.deflection_per_newton': 0.002}, None, 1e-4)]
@@ -65,7 +63,7 @@ SERVO = {'delay': 0.010, 'kp': JOINT.kp, 'kd': JOINT.kd, 'speed': JOINT.velocity
          'effort': JOINT.effort_limit, 'coulomb': 0.0, 'stiction': 0.0, 'bend': 0.0,
          'fading': 1e-3}
 FLOWN = [*(case[0] for case in CASES), *({'coulomb': 0.007, 'stiction': 0.010, 'fading': fading}
-         for fading in (0.03, 0.1)), {'effort': 0.05}, {'delay': 0.036}]
+         for fading in (0.03, 0.1)), {'effort': 0.05}, {'delay': 0.036}, {}]
 
 
 def servo(**changes):
@@ -192,13 +190,13 @@ def engine_of(made, starts):
     # four blocks; the forces of these readings are not those of the thrusts
     return Engine([made] * 4, dict.fromkeys(starts, Prior(0.03, 1.0, 0.0))
                   | dict.fromkeys(made.tangents, Prior(0.001, 0.3, 0.0)),
-                  [Entry(start.partition('@')[0], (start, *(f'{start}~{key}' for key in own)),
-                         None, False) for start, own in starts.items()],
+                  [Entry(of_start(start)[0], (start, *(f'{start}~{key}' for key in own)),
+                         of_start(start)[1], False) for start, own in starts.items()],
                   dict.fromkeys(starts, (0.0, np.inf)),
                   curved=frozenset({*starts, *made.tangents}))
 
 
-@pytest.mark.parametrize(('factor', 'rounds'), [(0.1, 6), (0.3, 6), (0.7, 6), (0.5, 1)])
+@pytest.mark.parametrize(('factor', 'rounds'), [(0.1, 6), (0.7, 6), (0.5, 1)])
 def test_a_torque_limit_keeps_its_value_when_it_is_linearised_again(factor, rounds, monkeypatch):
     # with one round, the search ends far from where the limit acts
     monkeypatch.setattr(engine_module, 'MOST_ROUNDS', rounds)
@@ -218,6 +216,35 @@ def test_starts_that_are_not_named_do_not_act_in_the_flights_that_judge():
     solution = engine.run()
     assert solution.best == (1,) and solution.theta[engine.index['joint_friction@2']] != 0
     assert errors(engine, solution, [1], engine.flights)[3] > 0.9
+
+
+def one_servo(**changes):
+    """A flight of which the third servo alone has these changes."""
+    angles = servo().copy()
+    angles[:, 2] = servo(**changes)[:, 2]
+    return model(flight(angles))
+
+
+def test_the_gains_of_one_servo_are_recovered():
+    names = ['servo.kp[2]', 'servo.kd[2]', 'servo.kp[0]']
+    found = solved(one_servo(kp=0.26, kd=0.011), names, 'J', None, None, 6)
+    assert [KEYS[name].value(found[name]) for name in names] == pytest.approx(
+        [0.26, 0.011, JOINT.kp], abs=0.02)
+
+
+@pytest.mark.parametrize(('made', 'joint'), [
+    (lambda: one_servo(coulomb=0.008, stiction=0.008), 3),
+    (lambda: model(flight(servo(coulomb=0.008, stiction=0.008))), None)], ids=['one', 'all'])
+def test_friction_of_one_servo_is_that_of_its_joint_and_friction_of_all_is_one_effect(made, joint):
+    made = made()
+    engine = engine_of(made, {name: own for name, own in starts_in(KEYS, [made]).items()
+                              if of_start(name)[0] == 'joint_friction'})
+    solution = engine.run()
+    entry, = (engine.entries[k] for k in solution.best)
+    assert (entry.name, entry.member) == ('joint_friction', joint)
+    found = effect_of(solution, engine, KEYS, *solution.best, [*solution.best], made.starts)
+    assert found.get('joint') == joint
+    assert found['parameters']['coulomb']['value'] == pytest.approx(0.008, abs=0.0012)
 
 
 DESCRIBED = RobotParameters.load()

@@ -145,7 +145,7 @@ def gap(name):
     made, own = flight_model(), KEYS
     if CATALOGUE[name].each == 'term' or CATALOGUE[name].beside:    # of what a robot has
         robot = replace(with_effect(name), multibody=None)
-        own = {**all_keys(robot), **extra_keys()}
+        own = {**all_keys(robot), **extra_keys(robot)}
         made = model(Motion(duration=10.0).flight(), robot, BodyModel(robot, own, (0, 0)), own)
     limit = TREATMENTS[name].limit     # beyond this calm flight
     theta = {key.name: np.log(1e-5 if limit else 1 - key.typical) if key.relative
@@ -172,6 +172,18 @@ def test_a_consumer_applies_an_effect_or_states_why_not(consumer, name):
     before = plain(consumer, bool(CATALOGUE[name].beside))
     changed = found.shape != before.shape or not np.array_equal(found, before)
     assert changed != bool(reason), reason or f'{name} changes nothing'
+
+
+@pytest.mark.parametrize('name', CATALOGUE)
+def test_a_fit_has_a_complete_and_consistent_treatment_of_each_effect(name):
+    treatment = TREATMENTS[name]
+    assert list(treatment.sizes) == CATALOGUE[name].numbers
+    assert treatment.excited_by and treatment.separated_by
+    assert all(other in CATALOGUE for other in treatment.confused_with)
+    assert set(treatment.channels) <= set('BAWJ') and treatment.channels
+    assert all(len(start) == len(treatment.sizes) for start in treatment.starts)
+    assert all(size.step > 0 and size.typical > size.smallest > 0
+               for size in treatment.sizes.values())
 
 
 @pytest.mark.parametrize('name', CATALOGUE)

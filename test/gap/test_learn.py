@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from io import StringIO
+import json
 from pathlib import Path
 
 from flights import P, ROBOT
@@ -32,7 +33,8 @@ def made(tmp_path_factory):
     (folder / 'without.yaml').write_text('without: [wind]\n')
     result = gap_results([flight('windy_0')], [flight('windy_1')], console=console,
                          parameters=folder / 'without.yaml', apply=folder / 'corrected.yaml',
-                         learn=folder / 'effect.yaml', page=folder / 'gap.html')
+                         learn=folder / 'effect.yaml', page=folder / 'gap.html',
+                         json_path=folder / 'gap.json')
     return folder, result, console.file.getvalue()
 
 
@@ -47,12 +49,25 @@ def test_a_force_outside_the_candidates_is_found_with_its_size(made):
     assert effect['units'] == ['N', 'N'] and effect['source']['runs'] == [str(flight('windy_0'))]
     assert result['verdict'] == 'named' and result['formula']['closure'] > 0.9
     assert result['gap_after'] < result['gap_before']
-    assert 'F += k X' in printed and 'F += k X' in (folder / 'gap.html').read_text()
+    page = (folder / 'gap.html').read_text()
+    assert 'F += k X' in printed and 'F += k X' in page and 'src="http' not in page
+
+
+def test_the_json_has_the_fixed_keys(made):
+    results = json.loads((made[0] / 'gap.json').read_text())
+    for key in ('verdict', 'effects', 'where', 'gap_before', 'gap_after', 'noise_floor',
+                'closure', 'candidates', 'next_experiment', 'groups', 'false_alarm_probability'):
+        assert key in results
+    assert results['held_out'] and all(group['used'] for group in results['groups'].values())
+    assert {'channel', 'regime', 'excess'} <= set(results['where'][0])
+    assert {'flight', 'rotate', 'tilted'} <= {row['regime'] for row in results['where']}
+    names = {row['name'] for row in results['candidates']}
+    assert {'mass', 'rotor_drag', 'joint_command_latency'} <= names and 'wind' not in names
 
 
 def residual(robot, path):
     """RMS of the specific forces [m/s^2] that a robot file leaves of a flight."""
-    keys = {**all_keys(robot), **extra_keys()}
+    keys = {**all_keys(robot), **extra_keys(robot)}
     own = prepare(read_recording(path), robot, P, False)
     made = BagFlight(own, robot, BodyModel(robot, keys, (0.0, 0.0)), keys, P)
     return made.residual({}, 'B')['B'][made.mask[:, 0], :3].std()
@@ -65,6 +80,9 @@ def test_the_written_files_explain_another_flight(made):
         'windy_1')) for robot in (ROBOT, RobotParameters.load(file),
                                   RobotParameters.load(made[0] / 'corrected.yaml')))
     assert learned_effect < 0.6 * before and corrected < 0.6 * before
+    new = RobotParameters.load(made[0] / 'corrected.yaml')
+    assert replace(new, effects={}).hash() == RobotParameters.load().hash()
+    assert new.provenance['runs'] and new.provenance['date']
 
 
 def test_flights_that_the_robot_file_explains_have_no_formula():

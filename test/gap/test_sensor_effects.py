@@ -80,7 +80,7 @@ def test_a_fit_begins_at_the_sensor_effects_of_the_robot_file(name):
     neutral = CATALOGUE[name].parameters[parameter].neutral
     typical = TREATMENTS[name].sizes[parameter].typical
     known = replace(ROBOT, effects={name: {parameter: (np.array(neutral) + typical).tolist()}})
-    keys = {**all_keys(known), **extra_keys()}
+    keys = {**all_keys(known), **extra_keys(known)}
     given = model(MOTION.flight(), known, BODY, keys).residual({})
     theta = dict.fromkeys(names_of(name, parameter), typical)
     fitted = model(MOTION.flight()).residual(theta)

@@ -40,7 +40,7 @@ def test_feedback_of_gusts_in_a_smooth_task_is_no_effect(tmp_path):
 
 def test_a_late_mocap_is_named_although_it_is_noisy(tmp_path):
     late = flights(tmp_path, 5, ('mocap_time_offset', 0.015, 'plain'), course='lemniscate',
-                   conditions='published')
+                   conditions='published', duration=30.0)
     result = judged(late, [], ROBOT, P)
     assert names(result) == ['mocap_time_offset']
     low, high = result['effects'][0]['parameters']['delay']['interval']
@@ -52,7 +52,7 @@ def test_a_hidden_effect_is_named_though_the_sensors_differ_from_flight_to_fligh
     made = [replace(each, times=each.times | {
         topic: each.times[topic] + rng.uniform(-0.008, 0.008) for topic in (POSE, JOINTS)},
         values=each.values | {IMU: each.values[IMU] + rng.normal(size=6) * bias})
-        for each in flights(tmp_path, 6, ('rotor_drag', 0.6, 'plain'), holdout=1)]
+        for each in flights(tmp_path, 6, ('rotor_drag', 0.6, 'plain'), duration=30.0, holdout=1)]
     result = judged(made[:2], made[2:], ROBOT, P)
     assert result['verdict'] == 'named' and names(result) == ['rotor_drag']
     found = result['effects'][0]['parameters']['coefficient']
@@ -64,7 +64,7 @@ def test_a_hidden_effect_is_named_though_the_sensors_differ_from_flight_to_fligh
 
 def one_flight(folder, **more):
     """The engine's model of one short flight."""
-    keys = {**all_keys(ROBOT), **extra_keys()}
+    keys = {**all_keys(ROBOT), **extra_keys(ROBOT)}
     flight, = flights(folder, 7, duration=20.0, fit=1, **more)
     return BagFlight(flight, ROBOT, BodyModel(ROBOT, keys, (0.0, 0.0)), keys, P)
 

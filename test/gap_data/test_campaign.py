@@ -1,6 +1,5 @@
 """The campaign from cases to report, with a replacement of the tool."""
 
-import ast
 from dataclasses import replace
 import json
 from pathlib import Path
@@ -11,6 +10,7 @@ from gap_data.cases import Case, OTHERS
 from gap_data.make import make_case
 from gap_data.score import markdown, score
 import pytest
+from test_imports import imports
 
 STUB = """
 import json, pathlib, sys
@@ -78,17 +78,10 @@ def test_a_campaign_keeps_and_scores_the_answers_of_a_tool(folder, tmp_path):
 ROOT = Path(__file__).resolve().parents[2] / 'benchmarks' / 'gap_data'
 
 
-def imported(path):
-    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            yield node.module or ''
-
-
 @pytest.mark.parametrize('path', sorted(ROOT.rglob('*.py')), ids=lambda path: path.stem)
 def test_only_messages_and_writer_of_bags_are_those_of_the_package(path):
-    names = {name for name in imported(path) if name.split('.')[0] == 'beetle_omni_ros'}
+    names = {name.rpartition('.')[0] for name, _ in imports(path)
+             if name.split('.')[0] == 'beetle_omni_ros'}
     shared = 'control.base', 'model.readings', 'bags.bag_writer'
     assert names == ({f'beetle_omni_ros.{name}' for name in shared} if path.stem == 'bags'
                      else set())
@@ -98,6 +91,6 @@ def test_the_cache_key_covers_every_file_of_the_generator():
     files, left = set(), ['make']
     while left:
         files.add(file := left.pop())
-        left += [name.removeprefix('gap_data.') for name in imported(ROOT / f'{file}.py')
-                 if name.startswith('gap_data.') and name.removeprefix('gap_data.') not in files]
+        left += {name.split('.')[1] for name, _ in imports(ROOT / f'{file}.py')
+                 if name.startswith('gap_data.')} - files
     assert {f'{file}.py' for file in files} & OTHERS == {'cases.py'}

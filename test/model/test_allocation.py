@@ -18,8 +18,8 @@ LIMIT = ROBOT.joints.position_limit
 def independent_wrench(robot, tilt, thrust):
     """Sum over rotors with scipy's rotation about the arm: the oracle of the forward map."""
     force, torque = np.zeros(3), np.zeros(3)
-    for i in range(4):
-        turn = Rotation.from_rotvec(tilt[i] * robot.tilt_axes[i])
+    for i, yaw in enumerate(robot.rotors.arm_yaw):
+        turn = Rotation.from_rotvec(tilt[i] * np.array([np.cos(yaw), np.sin(yaw), 0.0]))
         push = turn.apply([0.0, 0.0, thrust[i]])
         force += push
         torque += np.cross(robot.rotors.positions[i], push) \

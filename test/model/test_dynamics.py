@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from test_allocation import independent_wrench
 
 from beetle_omni_ros.model import dynamics as model
 from beetle_omni_ros.model.effects import CATALOGUE
@@ -22,15 +23,9 @@ def random_state(seed):
 
 def newton_euler(robot, velocity, quaternion, rate, tilt, thrust):
     """Textbook equations, rotor by rotor, with scipy's rotations."""
-    attitude = Rotation.from_quat(quaternion)
-    force, torque = np.zeros(3), np.zeros(3)
-    for i in range(4):
-        axis = [np.cos(robot.rotors.arm_yaw[i]), np.sin(robot.rotors.arm_yaw[i]), 0]
-        up = Rotation.from_rotvec(tilt[i] * np.array(axis)).apply([0, 0, 1])
-        force += thrust[i] * up
-        torque += np.cross(robot.rotors.positions[i], thrust[i] * up) \
-            - robot.rotors.spin[i] * robot.rotors.torque_to_thrust_ratio * thrust[i] * up
-    acceleration = attitude.apply(force) / robot.mass - [0, 0, robot.gravity]
+    force, torque = independent_wrench(robot, tilt, thrust)
+    acceleration = Rotation.from_quat(quaternion).apply(force) / robot.mass \
+        - [0, 0, robot.gravity]
     inertia = np.diag(robot.inertia)
     return acceleration, np.linalg.solve(inertia, torque - np.cross(rate, inertia @ rate))
 

@@ -65,3 +65,11 @@ def test_a_map_with_a_falling_part_is_refused(coefficients):
     row = RotorMapRow(voltage=23.0, thrust_max=16.0, coefficients=np.array(coefficients, float))
     with pytest.raises(ParameterError, match='at 23 V: duty .* expected a rise'):
         ThrustMap(replace(ROTORS, map=(row,)))
+
+
+def test_the_limit_falls_below_the_lowest_row_and_is_constant_with_one_row():
+    lowest, *rest = sorted(ROTORS.map, key=lambda row: row.voltage)
+    slope = (rest[0].thrust_max - lowest.thrust_max) / (rest[0].voltage - lowest.voltage)
+    assert MAP.thrust_limit_below(lowest.voltage - 1) == pytest.approx(lowest.thrust_max - slope)
+    one = ThrustMap(replace(ROTORS, map=(lowest,)))
+    assert one.thrust_limit_below(lowest.voltage - 1) == lowest.thrust_max

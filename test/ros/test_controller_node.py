@@ -1,4 +1,4 @@
-"""Nodes of registered controllers: by name, by class, when they step, what they log."""
+"""Nodes of registered controllers: by name, by class, their files, which may stand by."""
 
 from pathlib import Path
 
@@ -6,8 +6,10 @@ import pytest
 from rclpy.parameter import Parameter
 
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.ros import graph
+from beetle_omni_ros.ros.graph import controller_nodes
 from beetle_omni_ros.ros.nodes import supervisor_node
 from beetle_omni_ros.ros.runner import maker
 
@@ -52,3 +54,28 @@ def test_a_component_of_others_is_a_node_with_its_topics(make):
     assert '/observer/force' in {one.topic_name for one in node.publishers}
     assert {'/command', '/odom', '/imu/data_raw'} <= {one.topic_name for one in node.subscriptions}
     assert node.get_name() == node.component.name == 'wrench_observer_node'
+
+
+def test_files_reach_their_nodes_and_a_shipped_policy_that_cannot_fly_is_left_out(
+        tmp_path, monkeypatch):
+    pytest.importorskip('onnx')
+    from policy_files import write
+    policy = str(write(tmp_path / 'policy.onnx'))
+    other = {'robot_file': str(share_path('params/robot_weak_and_heavy.yaml'))}
+    nmpc = tmp_path / 'nmpc.yaml'
+    nmpc.write_text('limits: {velocity: 2.0}\n')
+    nodes, _ = controller_nodes('nmpc', {}, policy=policy, nmpc=str(nmpc))
+    assert list(nodes) == ['nmpc_node', 'rl_node']
+    assert nodes['nmpc_node'] == {'nmpc_file': str(nmpc)}
+    nodes, _ = controller_nodes('nmpc', other, policy=policy)
+    assert nodes['rl_node'] == {**other, 'policy': policy}
+    # A policy that the user names is refused, also on standby, instead of being left out.
+    for active, robot, file, reason in (
+            ('rl', {}, 'none.onnx', 'no such file'), ('nmpc', {}, 'none.onnx', 'no such file'),
+            ('nmpc', {}, nmpc, 'checksum')):
+        with pytest.raises(ParameterError, match=reason):
+            controller_nodes(active, robot, policy=str(tmp_path / file))
+    with pytest.raises(ParameterError, match="--policy .*: for the controller 'rl', which does"):
+        controller_nodes('nmpc', {}, policy=policy, standby=False)
+    monkeypatch.setattr('beetle_omni_ros.ros.graph.unfit', lambda *_: 'no onnxruntime')
+    assert controller_nodes('nmpc', {}) == ({'nmpc_node': {}}, {'rl': 'no onnxruntime'})

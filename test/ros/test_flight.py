@@ -32,35 +32,22 @@ OBSERVER = f'{Path(__file__).parents[2]}/examples/own_component.py:WrenchObserve
 NODES = ('recorder_node', 'sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node', 'reference_node')
 
 
-def test_switches_and_the_loss_of_recorder_reference_controller_and_estimator(ros_domain,
-                                                                              tmp_path):
+def test_recorder_reference_controller_and_estimator_are_lost_one_after_another(ros_domain,
+                                                                                tmp_path):
     task, bag = tmp_path / 'poses.csv', tmp_path / 'bag'
     task.write_text(HEADER + '0,0,1.1,0,0,0\n0.3,0,1.1,15,0,0\n' * 20)
-    parameters = {name: {} for name in (*NODES, 'rl_node')}
+    parameters = {name: {} for name in NODES}
     parameters['recorder_node'] = {'bag': str(bag)}
     parameters['reference_node'] = {'task': str(task)}
     with running_graph(in_simulated_time(parameters), tmp_path, ros_domain,
                        groups={name: [name] for name in parameters},
                        ready=lambda one: one.ready and one.progress) as (graph, witness):
         witness.take_off()
-        switches(witness)
         loses_one_node_after_another(graph, witness, bag)
 
 
-def switches(witness):
-    """Select each controller; test/evaluation checks that no command jumps."""
-    names = ['rl', 'nmpc']
-    for name in names:
-        assert witness.stays_in_the_air(0.5)
-        assert witness.wait(lambda name=name: witness.set(
-            'supervisor_node', 'controller', name)[0], 10)
-        assert witness.wait(lambda name=name: witness.state == f'flying:{name}', 2), witness.states
-    assert not witness.set('supervisor_node', 'controller', 'pid')[0]
-    first = witness.states.index('flying:nmpc')
-    assert witness.states[first:] == ['flying:nmpc', *(f'flying:{name}' for name in names)]
-
-
 def loses_one_node_after_another(graph, witness, bag):
+    assert witness.stays_in_the_air(1.0)
     killed_at = witness.truth.stamp
     graph.kill('recorder_node')
     assert witness.stays_in_the_air(0.5)

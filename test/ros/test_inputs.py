@@ -22,10 +22,9 @@ from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.flight.component import ERROR, IDENTITY
 from beetle_omni_ros.model.schema import RunError
 from beetle_omni_ros.ros import wire
-from beetle_omni_ros.ros.bridge_nodes import joint_bridge_node, rotor_bridge_node
+from beetle_omni_ros.ros.bridge_nodes import joint_bridge_node
 from beetle_omni_ros.ros.node import FlightNode
 from beetle_omni_ros.ros.nodes import controller_node, RecorderNode
-from beetle_omni_ros.ros.sim_node import SimNode
 
 pytestmark = pytest.mark.real_time
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -117,13 +116,10 @@ def test_a_recorder_that_cannot_write_keeps_no_messages(make_bench, tmp_path, mo
     assert not recorder._received and recorder._bag_status()[0] == ERROR
 
 
-@pytest.mark.parametrize(('kind', 'overrides'), [
-    (SimNode, ()), (joint_bridge_node, ('port:=/tmp/none/a',)),
-    (rotor_bridge_node, ('port:=/tmp/none/b',))])
-def test_commands_come_with_the_identity_of_their_publisher(make_bench, kind, overrides):
+def test_commands_come_with_the_identity_of_their_publisher(make_bench):
     """Component refuses those of others, see test/flight."""
-    bench, own = make_bench(*overrides), 'supervisor_node:0123abcd'
-    node = bench.add(kind())
+    bench, own = make_bench('port:=/tmp/none/a'), 'supervisor_node:0123abcd'
+    node = bench.add(joint_bridge_node())
     commands = bench.publisher(JointState, 'command', wire.profile(COMMAND))
     identities = bench.publisher(String, IDENTITY, wire.profile(LATCHED))
     entry = node.component.inputs['command']

@@ -42,7 +42,6 @@ def wait_until_it_spins(process):
 @pytest.mark.parametrize('node, arguments, named', [
     ('ekf_node', ['-p', 'imu.rat:=100.0'], "'imu.rat': unknown key; did you mean 'rate'"),
     ('ekf_node', ['--params-file', 'broken.yaml'], 'line 3'),
-    ('reference_node', ['-p', 'task:=somersault'], "task 'somersault': expected"),
     ('composed absent.module:My', [], "no module 'absent'")])
 def test_unusable_parameters_end_in_one_line_and_status_2(ros_domain, tmp_path, node, arguments,
                                                           named):

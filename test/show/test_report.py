@@ -1,10 +1,11 @@
-"""The report of flights without targets or with an early end."""
+"""The report of flights without targets or with an early end, and the colours of its runs."""
 
 import io
 
 import numpy as np
 from rich.console import Console
 from synthetic_flights import (
+    fly,
     write_diagnostic,
     write_odom,
     write_state,
@@ -14,8 +15,12 @@ from synthetic_flights import (
 
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.bags.bag_writer import BagWriter
+from beetle_omni_ros.bags.log import LogRecorder
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.show.report import run_report
+from beetle_omni_ros.control.tasks import make_task
+from beetle_omni_ros.show.figures import LINES
+from beetle_omni_ros.show.report import make_runs, run_report
 
 LEVEL = np.array([0, 0, 0, 1.0])
 
@@ -73,3 +78,17 @@ def test_the_outcome_and_faults_are_on_the_page_and_in_the_table(tmp_path):
                      'injected: rotor_stops at=5 rotor=2', 'plant used.yaml'):
         assert expected in text, expected
     assert 'landing: rotor2_lost at 1.5 s' in text and 'rotor2_lost at' in printed.getvalue()
+
+
+def test_runs_of_a_report_have_the_colours_of_their_controllers_in_any_order():
+    logs = {}
+    for name in ('nmpc', 'rl'):
+        fly(recorder := LogRecorder(), make_task('random1'), controller=name, duration=3.0)
+        logs[name] = recorder.log()
+    for order in (logs, reversed(logs)):
+        for run in make_runs({name: logs[name] for name in order}):
+            assert run.colour == LINES[run.label][0]
+    first, *again = (run.colour for run in make_runs({str(k): logs['nmpc'] for k in range(6)}))
+    assert first == LINES['nmpc'][0] and len(set(again)) == 5
+    assert not {line[0] for line in LINES.values()} & set(again)
+    assert set(LINES) == set(registry.SHIPPED)

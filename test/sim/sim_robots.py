@@ -13,6 +13,21 @@ ROBOT = RobotParameters.load()
 WORLD = SimulatorParameters.load()
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 HIGH = np.array([0.0, 0.0, 20.0])
+# Each effect of the body equations but for modules and formulas.
+EQUATIONS = {
+    'mass': {'mass': 3.3}, 'inertia': {'inertia': (0.08, 0.07, 0.11)},
+    'centre_of_mass': {'offset': (0.01, -0.015, 0.02)}, 'thrust_coefficient': {'scale': 0.93},
+    'rotor_thrust_coefficient': {'scale': [1.0, 0.9, 1.05, 0.97]},
+    'torque_coefficient': {'torque_to_thrust_ratio': 0.021},
+    'joint_offset': {'offset': [0.05, -0.1, 0.2, 0.03]}, 'wind': {'force': [1.0, -2.0, 0.5]},
+    'wind_velocity': {'velocity': [3.0, -2.0, 1.0]},
+    'body_drag': {'coefficient': 0.11}, 'rotor_drag': {'coefficient': 0.4},
+    'rotor_hub_moment': {'coefficient': 0.1}, 'axial_inflow': {'per_rotor': 0.4},
+    'translational_lift': {'per_rotor': 0.03}, 'tilt_thrust_loss': {'loss_at_60deg': 0.06},
+    'ground_effect': {'gain_at_0.25m': 0.2},
+    'propeller_gyroscopic_torque': {'angular_momentum_at_hover': 0.066},
+    'rotor_acceleration_torque': {'angular_momentum_at_hover': 0.05},
+    'voltage_sag': {'exponent': 1.3}}
 
 
 def massless_modules(**changes):

@@ -11,30 +11,16 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from sim_robots import acceleration, massless_modules, plant, ROBOT
+from sim_robots import acceleration, EQUATIONS, massless_modules, plant, ROBOT
 
 from beetle_omni_ros.model import dynamics
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.rotations import normalized
 from beetle_omni_ros.sim.forces import ServoLoads
 
-ALL = {
-    'mass': {'mass': 3.3}, 'inertia': {'inertia': (0.08, 0.07, 0.11)},
-    'centre_of_mass': {'offset': (0.01, -0.015, 0.02)}, 'thrust_coefficient': {'scale': 0.93},
-    'rotor_thrust_coefficient': {'scale': [1.0, 0.9, 1.05, 0.97]},
-    'torque_coefficient': {'torque_to_thrust_ratio': 0.021},
-    'joint_offset': {'offset': [0.05, -0.1, 0.2, 0.03]}, 'wind': {'force': [1.0, -2.0, 0.5]},
-    'wind_velocity': {'velocity': [3.0, -2.0, 1.0]},
-    'body_drag': {'coefficient': 0.11}, 'rotor_drag': {'coefficient': 0.4},
-    'rotor_hub_moment': {'coefficient': 0.1}, 'axial_inflow': {'per_rotor': 0.4},
-    'translational_lift': {'per_rotor': 0.03}, 'tilt_thrust_loss': {'loss_at_60deg': 0.06},
-    'ground_effect': {'gain_at_0.25m': 0.2},
-    'propeller_gyroscopic_torque': {'angular_momentum_at_hover': 0.066},
-    'rotor_acceleration_torque': {'angular_momentum_at_hover': 0.05},
-    'voltage_sag': {'exponent': 1.3}}
-DRAG = {'body_drag': ALL['body_drag']}      # by which a wind velocity acts
+DRAG = {'body_drag': EQUATIONS['body_drag']}      # by which a wind velocity acts
 EFFECTS = {'none': {}, **{name: {name: values} | (DRAG if CATALOGUE[name].beside else {})
-                          for name, values in ALL.items()}, 'all': ALL}
+                          for name, values in EQUATIONS.items()}, 'all': EQUATIONS}
 SERVOS = {'joint_deflection': {'deflection_per_newton': 0.002}}
 NOT_COMPARED = {'joint_friction', 'module_reaction', 'formula'}     # see above; one equation
 VOLTAGE_RATIO = 0.87

@@ -1,26 +1,20 @@
 """The firmware in C against the protocol, without clock; its build with sanitizers."""
 
-from dataclasses import replace
 from pathlib import Path
 import shutil
 import subprocess
 import tempfile
 
 from hypothesis import example, given, settings, strategies
-import numpy as np
 import pytest
 import reference_packets as reference
 
 pytest.importorskip('pymavlink')
 
 from beetle_omni_ros.drivers.mavlink import BOARD, common, HOST, MavlinkReceiver
-from beetle_omni_ros.flight.evaluate import run_evaluate
-from beetle_omni_ros.model.parameters import RobotParameters
-from beetle_omni_ros.model.parts import duty_of_command, ThrustMap
 from beetle_omni_ros.model.schema import ParameterError
 from beetle_omni_ros.sim.emulated import motor_board as firmware
 from beetle_omni_ros.sim.emulated.motor_board import BoardFirmware, library, NUMBERS
-from beetle_omni_ros.sim.simulator import Simulator
 
 BOOTED = 100.0
 STOPPED = (0.0,) * 4
@@ -212,25 +206,6 @@ def test_after_any_events_rotors_turn_only_if_armed_and_by_fresh_targets(events)
         if any(bench.outputs):
             assert not disarmed and bench.state == firmware.RUNNING
             assert bench.now - last_target < NUMBERS['target_timeout'] + 1e-5
-
-
-def test_a_flight_whose_thrusts_pass_the_board_as_bytes_reaches_its_pose(monkeypatch):
-    thrust_map, direct = ThrustMap(RobotParameters.load().rotors), Simulator.command
-    bench = Bench()
-
-    def command(simulator, wanted):
-        voltage, bench.now = simulator.battery.voltage, BOOTED + simulator.time
-        bench.beat()
-        if bench.state == firmware.DISARMED:
-            bench.arm()
-        bench.target(*thrust_map.command(wanted.thrust, voltage))
-        direct(simulator, replace(wanted, thrust=thrust_map.thrust(
-            duty_of_command(np.array(bench.outputs)), voltage)))
-
-    monkeypatch.setattr(Simulator, 'command', command)
-    result = run_evaluate(controllers=['hover'], task='random1')['hover']
-    assert result['success_rate'] == 1.0
-    assert not bench.board.refused and not bench.board.timeouts
 
 
 @pytest.mark.parametrize(('failed', 'rpm', 'after', 'flags'), [

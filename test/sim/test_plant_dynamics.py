@@ -14,33 +14,6 @@ from beetle_omni_ros.sim.plant import PAYLOAD_DEPTH
 WEIGHTLESS = replace(ROBOT, gravity=0.0)
 
 
-def spinning(made, velocity, angular_velocity):
-    made.data.qvel[:6] = np.concatenate([velocity, angular_velocity])
-
-
-def test_free_fall_follows_the_parabola():
-    made = plant(position=[0, 0, 30])
-    spinning(made, [1.0, -2.0, 3.0], np.zeros(3))
-    for _ in range(200):
-        made.step()
-    qpos, qvel = made.state
-    np.testing.assert_allclose(qpos[:3], [1, -2, 33 - ROBOT.gravity / 2], atol=1e-9)
-    np.testing.assert_allclose(qvel[:3], [1, -2, 3 - ROBOT.gravity], atol=1e-9)
-    np.testing.assert_allclose(made.specific_force, 0, atol=1e-9)
-
-
-def test_torque_free_spin_keeps_momenta_and_centre():
-    made = plant(WEIGHTLESS, quaternion=rotations.from_rpy(0.4, -0.2, 1.0))
-    spinning(made, [0.3, 0.1, -0.2], [3.0, -2.0, 4.0])
-    linear, angular, centre = momenta(made)
-    for _ in range(200):
-        made.step()
-    linear_after, angular_after, centre_after = momenta(made)
-    np.testing.assert_allclose(linear_after, linear, atol=1e-7)
-    np.testing.assert_allclose(angular_after, angular, atol=1e-6)
-    np.testing.assert_allclose(centre_after, centre + linear / ROBOT.mass, atol=1e-6)
-
-
 @pytest.mark.parametrize('target', [0.3, 3.0], ids=['servo linear', 'rate limited'])
 def test_tilting_modules_react_on_the_body_and_keep_momenta(target):
     made = plant(WEIGHTLESS)

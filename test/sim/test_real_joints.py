@@ -27,16 +27,6 @@ def ticks(duration):
     return np.arange(0.0, duration, TICK)
 
 
-def test_a_joint_below_its_stiction_rests():
-    stiction = 0.012
-    targets = np.tile(0.9 * stiction / KP, (len(ticks(1.0)), 4))
-    encoder, _, _ = flown(targets, joint_friction={'coulomb': 0.008, 'stiction': stiction})
-    assert np.abs(encoder).max() < 1e-5
-    beyond, _, _ = flown(1.2 / 0.9 * targets, joint_friction={'coulomb': 0.008,
-                                                            'stiction': stiction})
-    assert beyond[-1].min() > 0.5 * targets[-1, 0]
-
-
 def test_servos_with_friction_move_as_the_servo_model():
     gains, damping = (0.18, 0.16, 0.2, 0.22), (0.0042, 0.004, 0.005, 0.0045)
     coulomb = (0.002, 0.004, 0.003, 0.001)

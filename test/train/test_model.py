@@ -57,16 +57,6 @@ def test_one_period_agrees_with_the_dynamics_away_from_servo_limits():
                  rate=4e-3, tilt=1e-3, tilt_rate=0.1, thrust=1e-9)
 
 
-def test_the_rotors_lag_is_exact():
-    x, u = states(30, 4, tilt_step=0.0)
-    low, high = ROBOT.rotors.thrust_min, ROBOT.rotors.thrust_max
-    target = np.clip(u[:, 4:], low, high)
-    assert (target != u[:, 4:]).any()
-    for duration in (0.01, 0.13):
-        expected = target + np.exp(-duration / ROBOT.rotors.time_constant) * (x[:, 21:] - target)
-        np.testing.assert_allclose(trained(ROBOT, x, u, duration)[:, 21:], expected, atol=1e-12)
-
-
 def test_a_wrench_and_another_mass_agree_with_newton():
     x, u = states(20, 5, tilt_step=0.0)
     x[:, UNITS['rate']] = 0

@@ -6,25 +6,15 @@ import casadi as ca
 from learning import ROBOT, uniform
 import numpy as np
 import pytest
+from sim_robots import EQUATIONS
 import torch
 
 from beetle_omni_ros.model.effects import CATALOGUE, validated
 from beetle_omni_ros.train import model
 
 EFFECTS = validated({
-    'mass': {'mass': 3.3}, 'inertia': {'inertia': [0.08, 0.07, 0.11]},
-    'centre_of_mass': {'offset': [0.01, -0.015, 0.02]},
+    **{name: values for name, values in EQUATIONS.items() if name != 'voltage_sag'},
     'module_reaction': {'module_inertia': 2e-4, 'mass_moment': 3e-3},
-    'thrust_coefficient': {'scale': 0.93},
-    'rotor_thrust_coefficient': {'scale': [1.0, 0.9, 1.05, 0.97]},
-    'torque_coefficient': {'torque_to_thrust_ratio': 0.021}, 'wind': {'force': [1.0, -2.0, 0.5]},
-    'wind_velocity': {'velocity': [2.0, -1.0, 0.3]},
-    'body_drag': {'coefficient': 0.11}, 'rotor_drag': {'coefficient': 0.4},
-    'rotor_hub_moment': {'coefficient': 0.1}, 'axial_inflow': {'per_rotor': 0.3},
-    'translational_lift': {'per_rotor': 0.03}, 'tilt_thrust_loss': {'loss_at_60deg': 0.08},
-    'ground_effect': {'gain_at_0.25m': 0.08}, 'joint_offset': {'offset': [0.03, -0.02, 0.05, 0.0]},
-    'propeller_gyroscopic_torque': {'angular_momentum_at_hover': 0.06},
-    'rotor_acceleration_torque': {'angular_momentum_at_hover': 0.03},
     'formula': {'expressions': ['force: velocity * speed', 'rotor_torque: turning * spin * thrust',
                                 'thrust: thrust * ground'], 'coefficients': [-0.1, 0.03, 0.2]}})
 EVERYTHING = replace(ROBOT, effects=EFFECTS)

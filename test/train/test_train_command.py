@@ -7,6 +7,7 @@ import shutil
 import learning  # noqa: F401
 import numpy as np
 import pytest
+from test_cli import refused
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.control.base import PoseTarget, State
@@ -27,15 +28,6 @@ def run(tmp_path_factory):
     assert cli.main(['train', '--smoke', '--device', 'cpu', '--output', str(folder), '--seed',
                      '5', '--json', str(folder.parent / 'result.json')]) == 0
     return folder
-
-
-def refused(capsys, *arguments):
-    """Run the command, expect status 2 and one line on standard error; return the line."""
-    capsys.readouterr()
-    assert cli.main(['train', *map(str, arguments)]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1, lines
-    return lines[0]
 
 
 def test_a_run_writes_all_documented_files(run):
@@ -113,12 +105,12 @@ def test_unusable_input_is_refused_before_any_file_is_written(capsys, tmp_path, 
                                                               arguments, named):
     monkeypatch.chdir(tmp_path)
     Path('file').touch()
-    assert named in refused(capsys, '--smoke', '--device', 'cpu', *arguments.split())
+    assert named in refused(capsys, 'train', '--smoke', '--device', 'cpu', *arguments.split())
     assert [path.name for path in tmp_path.iterdir()] == ['file']
 
 
 def test_another_run_is_not_overwritten(capsys, run):
     before = sorted(run.iterdir())
-    line = refused(capsys, *TINY, '--output', run)
+    line = refused(capsys, 'train', *TINY, '--output', run)
     assert 'holds the checkpoints of another run' in line and f'--resume {run}' in line
     assert sorted(run.iterdir()) == before

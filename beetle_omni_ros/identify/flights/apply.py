@@ -31,14 +31,15 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
         for parameter, found in effect['parameters'].items():
             spec = CATALOGUE[name].parameters[parameter]
             value = found['value']
+            own = values.get(parameter, number_of(robot, spec.number) if spec.number
+                             else spec.neutral)
             if member:
                 value = found.get('written', value)     # a zero is reported over a log's angles
-                all_four = list(values.get(parameter, spec.neutral))
-                all_four[member - 1] = value
-                value = all_four
+                every = list(own if np.ndim(own) else [own] * MEMBERS)
+                every[member - 1] = value
+                value = every
             elif spec.of_each:
-                own = number_of(robot, spec.number) if spec.number else spec.neutral
-                value = _of_each(values.get(parameter, own), found)
+                value = _of_each(own, found)
             values[parameter] = rounded(np.clip(value, spec.low, spec.high))
     return effects
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.flights.body import BodyModel
-from beetle_omni_ros.identify.flights.keys import delays_of, Key, TILT_BUS
+from beetle_omni_ros.identify.flights.keys import delays_of, Key, OF_ONE, of_start, TILT_BUS
 from beetle_omni_ros.identify.flights.servo import simulate, windows_of
 from beetle_omni_ros.identify.flights.signals import IMU_LAG, Signals
 from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear, warm
@@ -24,6 +24,7 @@ from beetle_omni_ros.identify.recording.bag import COMMAND, Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.identify.recording.series import low_pass, matrices, THIN, within
 from beetle_omni_ros.model.parameters import RobotParameters
+from beetle_omni_ros.model.parts import ThrustMap
 
 CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torque_z'),
             'A': ('acceleration_x', 'acceleration_y', 'acceleration_z'),
@@ -98,18 +99,15 @@ class BagFlight:
         """(N,) whether a grid point is not at the rotor limit for its voltage, nor grounded."""
         s, p = self.signals, self.p
         bad = s.pose({})[0][:, 2] < p.contact_height
-        rows = sorted(self.robot.rotors.map, key=lambda row: row.voltage)
-        if rows:
-            volts = s.voltage * self.robot.battery.full_voltage
-            most = np.interp(volts, [row.voltage for row in rows],
-                             [row.thrust_max for row in rows])
+        if self.robot.rotors.map:
+            most = ThrustMap(self.robot.rotors).thrust_limit_below(
+                s.voltage * self.robot.battery.full_voltage)
             commanded = self.flight.values[COMMAND][np.clip(np.searchsorted(
                 self.flight.times[COMMAND], s.t) - 1, 0, None), 4:].max(axis=1)
             bad |= commanded > p.limit_margin * most
         # Rotor lag: a limit also affects the following samples.
         memory = round(5 * self.robot.rotors.time_constant / p.grid)
-        spread = np.convolve(bad, np.ones(memory))[:len(bad)] > 0
-        return ~spread
+        return np.convolve(bad, np.ones(memory))[:len(bad)] == 0
 
     def _inputs(self, theta):
         """Inputs of the body equations, name -> (M, width)."""
@@ -160,7 +158,8 @@ class BagFlight:
     def linear(self, theta: dict[str, float], names: list[str]) -> Linear:
         """Residual and its slopes at deviations ``theta`` of keys, starts and tangents."""
         theta, own = self._real(theta)
-        ends = {name: self._ends(name, theta, own) for name in names if name in self.starts}
+        like = {name: self._of_all(name, own) for name in names if name in self.starts}
+        ends = {name: self._ends(name, theta, own) for name, other in like.items() if not other}
         # the servos of all at once; none of them changes a sensor
         sets = list({frozenset(each.items()): each for each in (
             theta, *(end for name, both in ends.items() for end in both
@@ -179,7 +178,10 @@ class BagFlight:
         keys = list(dict.fromkeys(key for key, _ in factors.values()))
         of_keys = self._slopes(theta, now, keys)
         for k, name in enumerate(names):
-            if name in self.starts:
+            if like.get(name):
+                joint = PLACE['J'].start + (of_start(name)[1] or 0) - 1
+                slopes[:, joint, k] = slopes[:, joint, names.index(like[name])]
+            elif name in self.starts:
                 groups = self._groups_of(name)
                 behind, ahead = (
                     now if end == theta and self.signals.model_tilts is None
@@ -196,9 +198,8 @@ class BagFlight:
     def _guided(self, theta, groups):
         """Residual with the tilts of the servo model at ``theta``, where they are of a model."""
         before, run = self.signals.model_tilts, self._runs.get(frozenset(theta.items()))
-        if before is None or run is None:
-            return self.residual(theta, groups)
-        return self._with_tilts(before, run, theta, groups)
+        return self.residual(theta, groups) if before is None or run is None \
+            else self._with_tilts(before, run, theta, groups)
 
     def _with_tilts(self, before, run, theta, groups):
         """Residual at ``theta`` with fast tilts of simulated servos, not those ``before``."""
@@ -301,13 +302,22 @@ class BagFlight:
                 new[tangent] = 0.0
         return new
 
+    def _of_all(self, name, own):
+        """Start of all joints with the slopes of one of a joint, as servos are independent."""
+        effect, joint = of_start(name)
+        acts = any(of_start(each)[0] == effect for each in own)
+        return f'{effect}@{name.partition("@")[2]}' \
+            if joint and not acts and self._groups_of(name) == 'J' else None
+
     def _ends(self, name, theta, own):
         """Deviations without the effect of a start, and with it as far as it acts, else whole."""
-        start = self.starts[name]
-        # of another start of the same effect, only one can act
-        without = {key: theta[key] - own[name] * part if name in own else 0.0
-                   for key, part in start.items()}
-        without = {key: value for key, value in (theta | without).items() if abs(value) > 1e-12}
+        (effect, joint), without = of_start(name), dict(theta)
+        for other, factor in own.items():       # of one effect, only one start can act on a joint
+            also, member = of_start(other)
+            if also == effect and (member == joint or None in (member, joint)):
+                for key, part in self.starts[other].items():
+                    without[key] -= factor * part
+        without = {key: value for key, value in without.items() if abs(value) > 1e-12}
         return without, theta if name in own else self._started(without, {name: 1.0})
 
     def settle(self, theta: dict[str, float]) -> None:
@@ -363,8 +373,8 @@ class BagFlight:
         and a linear fit would exploit any difference between equivalent delays.
         """
         # Servos are independent, so one run with all gains changed gives the slope of each.
-        sources = [f'joint_bandwidth.{self.keys[name].parameter}'
-                   if self.keys[name].effect == 'servo' else name for name in names]
+        sources = [f'{OF_ONE[key.parameter]}.{key.parameter}' if key.effect == 'servo'
+                   else key.name for key in (self.keys[name] for name in names)]
         moved = list(dict.fromkeys([TILT_BUS, *sources]))
         sizes = [self.keys[name].step for name in moved]
         # Central differences: gains, loads and inertia scaled by one factor leave the motion

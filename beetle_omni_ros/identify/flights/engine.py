@@ -157,7 +157,7 @@ class Engine(Linearised):
         strong = sorted(sorted(allowed, key=lambda k: weight((k,)))[-PAIRED:])
         for chosen in (*singles, *combinations(strong, 2)):
             value = weight(chosen)
-            if value > top:
+            if value > top and self._apart(chosen):
                 best, top = chosen, value
         # Pairwise gains need not be transitive: the next set must be better than all before it.
         visited: list[tuple[int, ...]] = []
@@ -167,7 +167,7 @@ class Engine(Linearised):
                     for out in [set(), *({k} for k in best)]
                     for more in [set(), *({k} for k in allowed if k not in best)]}
             better = sorted(((self.gain(judge, c, best), c) for c in near - {best}
-                             if len(c) <= MOST), reverse=True)
+                             if len(c) <= MOST and self._apart(c)), reverse=True)
             best = next((c for gain, c in better if gain > 0 and all(
                 self.gain(judge, c, old) > 0 for old in visited)), best)
         weight(best)
@@ -175,6 +175,12 @@ class Engine(Linearised):
         posterior = judge.posterior(self.indices(best))
         return Solution(self.names, self.entries, gains, best, posterior, judge.equations, judge,
                         judge, spectra)
+
+    def _apart(self, chosen):
+        """Whether no effect of a set is one of all joints and also one of a single joint."""
+        own = {(self.entries[k].name, self.entries[k].member is None) for k in chosen
+               if not self.entries[k].varying}
+        return len(own) == len({name for name, _ in own})
 
     def _weighing(self, spectra, banned, generic):
         """Judge of sets; ``generic`` are the prior deviations of the discrepancy."""

@@ -22,7 +22,7 @@ import numpy as np
 
 from beetle_omni_ros.identify.flights.keys import Entry
 from beetle_omni_ros.identify.flights.spectrum import NONE, Spectrum
-from beetle_omni_ros.identify.inference.noise import few_blocks, within_limits
+from beetle_omni_ros.identify.inference.noise import few_blocks, positive, within_limits
 
 SCALES = 1.0, 3.0, 9.0  # times typical: the prior of a candidate is a mixture of these
 MIXED = log(len(SCALES))    # its price
@@ -249,9 +249,7 @@ class Judge:
             return c, none, np.zeros((0, 0)), np.zeros((len(self.mean), 0)), none
         own = np.linalg.inv(self.covariance[np.ix_(c, c)])
         direction = self.covariance[:, c] @ own                     # (K, d)
-        info = own - np.diag(self.narrow[c]**-2)
-        values, vectors = np.linalg.eigh(0.5 * (info + info.T))
-        info = vectors @ np.diag(np.maximum(values, 1e-9 * self.narrow[c].min()**-2)) @ vectors.T
+        info = positive(own - np.diag(self.narrow[c]**-2), self.narrow[c])[2]
         score = own @ self.mean[c]
         estimate = np.linalg.solve(info, score)
         slab = np.where(self.acting[c], EXACT, np.hypot(
@@ -287,11 +285,9 @@ class Judge:
         scores = (self.equations.scores - self.equations.slopes @ theta) @ direction
         scatter = scores.T @ scores * self.blocks / max(self.blocks - 1, 1)
         noise = direction.T @ self.equations.noise @ direction
-        values, vectors = np.linalg.eigh(0.5 * (noise + noise.T))
-        values = np.maximum(values, 1e-9 * max(values.max(), 1e-300))
-        root, less = (vectors * values**p @ vectors.T for p in (0.5, -0.5))
-        ratio, axes = np.linalg.eigh(less @ scatter @ less)
-        more = root @ (axes * (self.student * np.maximum(ratio, 1.0) - 1.0) @ axes.T) @ root
+        root, less, _ = positive(noise, np.maximum(np.diag(noise), 1e-300)**-0.5)
+        ratio, axes = np.linalg.eigh(less @ scatter @ less.T)
+        more = root @ (axes * (self.student * np.maximum(ratio, 1.0) - 1.0) @ axes.T) @ root.T
         inverse = np.linalg.inv(info)
         return inverse + inverse @ more @ inverse
 

@@ -13,7 +13,7 @@ value by what sensors and vehicles differ from flight to flight.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from operator import attrgetter
 
@@ -28,6 +28,9 @@ from beetle_omni_ros.model.terms import EffectParameter
 
 MODULES = 'module_reaction'
 NO_SIZE = Size(0.5, 0.0)     # of a parameter that only selects a form
+# Parameter of a servo -> effect that may also be of one joint, with keys 'servo.PARAMETER[k]'.
+OF_ONE = {parameter: name for name, treatment in TREATMENTS.items() for parameter in
+          treatment.sizes if CATALOGUE[name].parameters[parameter].of_each}
 # Effects without a slope at their neutral value; they need a start where they act.
 LIMITS = tuple(name for name, treatment in TREATMENTS.items() if treatment.starts)
 SWING = 'swing.ratio'        # logarithm of the apparent inertia of the servos
@@ -93,6 +96,12 @@ class Key:
         return self.base * math.exp(deviation) if self.relative else self.base + deviation
 
 
+def of_start(start: str) -> tuple[str, int | None]:
+    """Effect of a start, 'effect@k' or 'effect[joint]@k', and its joint if it is of one."""
+    name, _, member = start.partition('@')[0].partition('[')
+    return name, int(member[:-1]) if member else None
+
+
 def number_of(robot: RobotParameters, key: str) -> float | np.ndarray:
     """Value of the robot file at a dotted key."""
     return attrgetter(key)(robot)
@@ -128,10 +137,7 @@ def friction(robot: RobotParameters) -> tuple[np.ndarray, np.ndarray]:
 def all_keys(robot: RobotParameters) -> dict[str, Key]:
     """Keys of the whole catalogue with base values of ``robot``, by name."""
     keys: dict[str, Key] = {}
-    effects = dict(robot.effects)
-    if 'joint_friction' in effects:
-        effects['joint_friction'] = dict(zip(CATALOGUE['joint_friction'].parameters,
-                                             friction(robot), strict=True))
+    effects = _effects_of(robot)
     for name, effect in CATALOGUE.items():
         if name not in TREATMENTS or ignored('gap', name) or (
                 effect.beside and not set(effect.beside) & set(effects)):
@@ -155,6 +161,13 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
                                  effect.apply is not None, size.step, spec.form,
                                  not relative and spec.low == 0.0)
     return keys
+
+
+def _effects_of(robot):
+    """Effects of the file; stiction is the larger one."""
+    return robot.effects if 'joint_friction' not in robot.effects else {
+        **robot.effects, 'joint_friction': dict(zip(
+            CATALOGUE['joint_friction'].parameters, friction(robot), strict=True))}
 
 
 def _terms(robot, name, size):
@@ -184,8 +197,8 @@ def tolerances(p: GapParameters) -> dict[str, float]:
     return result
 
 
-def extra_keys() -> dict[str, Key]:
-    """Keys outside the catalogue: rotor positions, modules, servos, delays of the bus."""
+def extra_keys(robot: RobotParameters) -> dict[str, Key]:
+    """Keys outside the catalogue: rotor positions, modules, single servos, delays of the bus."""
     keys = {}
 
     def add(name, index, typical, groups, **more):
@@ -197,10 +210,15 @@ def extra_keys() -> dict[str, Key]:
         add(f'position.offset[{k}]', k, 0.001, 'B', body=True)
     add('modules.share', None, 0.05, 'BJ', step=0.05)
     add(SWING, None, 0.3, 'J', step=0.01)
+    common = all_keys(robot)
     for k in range(4):
         add(f'rotor.lag[{k}]', k, 0.1, 'B', step=0.02)
-        for gain in ('kp', 'kd'):
-            add(f'servo.{gain}[{k}]', k, 0.3, 'J', step=0.01)
+    for parameter, name in OF_ONE.items():
+        spec, like = CATALOGUE[name].parameters[parameter], common[f'{name}.{parameter}']
+        own = number_of(robot, spec.number) if spec.number else spec.neutral
+        each = np.broadcast_to(_effects_of(robot).get(name, {}).get(parameter, own), 4)
+        keys |= {text: replace(like, name=text, effect='servo', index=k, base=float(each[k]))
+                 for k, text in enumerate(f'servo.{parameter}[{k}]' for k in range(4))}
     for name, groups in ((TILT_BUS, 'J'), (THRUST_BUS, 'B')):
         add(name, None, 0.005, groups, parameter='delay')
     return keys

@@ -1,12 +1,14 @@
 """
 How well a solution explains flights: discrepancies, errors, and what repeats unexplained.
 
-Two tests look at the residual of forces and torques after the fit. They know nothing of causes.
+Three tests look at what the fit leaves. They know nothing of causes.
 
 - Repeatable: laws of thrusts, forces and torques that are fitted to one block predict the others.
   The gain is compared with that of drawn noise. What fits one block alone counts nothing.
 - Line: a frequency at which the whitened spectrum, the mean over the blocks, exceeds its
   neighbours by more than exponentially distributed power allows.
+- Tolerance: a number of the robot that is in no entry, such as the lag of one rotor, is fitted
+  far beyond its prior.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from dataclasses import dataclass
 from math import log
 
 import numpy as np
+from scipy.stats import chi2
 from scipy.stats import f as f_law
 
 from beetle_omni_ros.identify.flights.discrepancy import laws, placed
@@ -158,12 +161,13 @@ class Unexplained:
     Result of a test.
 
     Attributes:
-        kind: 'repeatable' or 'line'.
+        kind: 'repeatable', 'line' or 'tolerance'.
         probability: of a value as large without anything unexplained.
         gain: logarithm of the likelihood that the left-out blocks gain [nat]; of a line, that of
-            its power.
+            its power; of a tolerance, that of its prior.
         channels: those that show it, the largest first.
         frequency: of a line [Hz].
+        number: of the robot, beyond its tolerance, in words.
 
     """
 
@@ -172,13 +176,16 @@ class Unexplained:
     gain: float
     channels: tuple[str, ...]
     frequency: float | None = None
+    number: str = ''
 
     @property
     def sentence(self) -> str:
         """What was found, as the end of a sentence."""
-        what = f'a vibration of {self.frequency:.2g} Hz in ' + ' and '.join(
-            name.replace('_', ' ') for name in self.channels) if self.frequency else \
-            'a force or torque that depends on the motion and repeats'
+        what = 'a force or torque that depends on the motion and repeats'
+        if self.frequency:
+            what = f'a vibration of {self.frequency:.2g} Hz in ' + ' and '.join(
+                name.replace('_', ' ') for name in self.channels)
+        what = self.number or what
         return f'no known effect explains {what} (probability {self.probability:.1g})'
 
 
@@ -270,9 +277,29 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
         float(frequency[places[k]]))
 
 
+def beyond(engine: Engine, solution: Solution) -> Unexplained:
+    """Test of the numbers of the robot that have a tolerance, but are in no entry."""
+    taken = {key for entry in engine.entries for key in entry.keys}
+    own = [k for k, name in enumerate(engine.names[:engine.real])
+           if name not in taken and not engine.kept[k]]
+    if not own:
+        return Unexplained('tolerance', 1.0, 0.0, ())
+    sizes = solution.theta[own] / engine.narrow[own]
+    most, k = float(np.abs(sizes).max()), own[int(np.argmax(np.abs(sizes)))]
+    effect, _, index = engine.names[k].rstrip(']').partition('[')
+    place = int(index or 0)
+    words = {'rotor.lag': f'the lag of rotor {place + 1} (ln of the ratio to the file)',
+             'position.offset': f"the {'xyz'[place % 3]} of rotor {place // 3 + 1} [m]",
+             'modules.share': 'the share of the tilting modules in the file'}
+    return Unexplained(
+        'tolerance', min(1.0, len(own) * float(chi2.sf(most**2, 1))), float(sizes @ sizes) / 2, (),
+        number=f'a deviation of {solution.theta[k]:.2g} of {words.get(effect, effect)}, '
+        f'{most:.0f} standard deviations of its tolerance')
+
+
 def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
     """
-    Both tests; the most improbable first.
+    The tests; the most improbable first.
 
     Where an entry is excluded, or noise hides the motion, the controller feeds noise back, and
     what repeats may be its answer; nothing is tested there.
@@ -283,5 +310,5 @@ def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
         return []
     left = [found.at(fitted(engine, solution, k)) for k, found in enumerate(solution.spectra)]
     rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
-            line(solution.spectra, left, engine.channels, own)]
+            line(solution.spectra, left, engine.channels, own), beyond(engine, solution)]
     return sorted(rows, key=lambda row: row.probability)

@@ -28,7 +28,7 @@ ALPHA = 0.05            # probability of a false alarm that is accepted
 CROWD = 4               # members of a set from which the flights do not decide
 NAMING = 'named', 'named_set'
 WIDEST = 9.0            # typical deviations of the widest prior of an entry
-TESTS = 2               # of what is unexplained; they share the accepted probability
+TESTS = 3               # of what is unexplained; they share the accepted probability
 MOST_FED_BACK = 2       # entries that feedback may exclude; with more, the loop hides the robot
 FORM_DEVIATION = 0.1    # of a value: deviation by the error of form of its law
 MINOR = 0.1             # share of the gain of what repeats below which names explain too little
@@ -214,7 +214,8 @@ def of_a_rotor(effect: dict, slow: list[dict]) -> bool:
 
 def member_of(entry: Entry) -> dict[str, int]:
     """Number of the rotor or joint of an entry of one of them."""
-    return {CATALOGUE[entry.name].each: entry.member} if entry.member is not None else {}
+    return {CATALOGUE[entry.name].each or 'joint': entry.member} \
+        if entry.member is not None else {}
 
 
 def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Posterior,

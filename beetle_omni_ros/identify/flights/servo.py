@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.identify.flights.keys import friction, Key, MODULES
+from beetle_omni_ros.identify.flights.keys import friction, Key, MODULES, OF_ONE
 from beetle_omni_ros.identify.flights.signals import Signals
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.recording.bag import COMMAND
@@ -93,12 +93,12 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray, whic
         return np.array([result(values.get(name, 0.0)) for values in sets])[:, None, None]
 
     def each(name):
-        return np.concatenate([column(f'{name}[{k}]', np.exp) for k in range(4)], axis=2)
+        return np.concatenate([column(f'{name}[{k}]') for k in range(4)], axis=2)
 
-    numbers, acting = _of_effects(robot, column)
+    numbers, acting = _of_effects(robot, column, each)
     joint, hanging = robot.joints, robot.effects.get(MODULES, {})
-    kp = joint.kp * numbers['kp'] * each('servo.kp')
-    kd = joint.kd * numbers['kd'] * each('servo.kd')
+    kp = joint.kp * numbers['kp'] * np.exp(each('servo.kp'))
+    kd = joint.kd * numbers['kd'] * np.exp(each('servo.kd'))
     speed = joint.velocity_limit * numbers['velocity_limit']
     effort = joint.effort_limit * numbers['effort_limit']
     loads = _loads(windows, hanging, modules, column)
@@ -131,7 +131,7 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray, whic
     return shown.transpose(1, 0, 2, 3)
 
 
-def _of_effects(robot, column):
+def _of_effects(robot, column, each):
     """
     Servo parameters that the catalogue changes.
 
@@ -150,7 +150,8 @@ def _of_effects(robot, column):
             continue
         base = {**robot.effects, **own}.get(name, {})
         # a servo equation is unstable outside the physical range
-        values = {p: np.maximum(np.asarray(base.get(p, spec.neutral)) + column(f'{name}.{p}'),
+        values = {p: np.maximum(np.asarray(base.get(p, spec.neutral)) + column(f'{name}.{p}')
+                                + (each(f'servo.{p}') if p in OF_ONE else 0.0),
                                 spec.low) for p, spec in effect.parameters.items()}
         if any(values[p].any() for p in effect.numbers):
             acting.append((effect.servo, values))

@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.identify.flights.keys import base_of, names_of, THRUST_BUS, TILT_BUS
+from beetle_omni_ros.identify.flights.keys import base_of, names_of, OF_ONE, THRUST_BUS, TILT_BUS
 from beetle_omni_ros.identify.recording.bag import BATTERY, COMMAND, IMU, JOINTS, POSE, Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.identify.recording.relations import white_noise
@@ -34,6 +34,7 @@ IMU_LAG = 'imu_filter_lag.delay'
 # Keys that change thrusts after their delay.
 LAGS = ('rotor_lag.time_constant', 'thrust_saturation.thrust_max',
         *(f'rotor.lag[{k}]' for k in range(4)))
+PLAY = tuple(f'servo.gap[{k}]' for k in range(4))
 
 
 class Signals:
@@ -77,10 +78,11 @@ class Signals:
         # Sensor effects and backlash of the robot file; deviations are added to them.
         self.file = {key: float(value) for name, values in robot.effects.items()
                      for parameter, given in values.items()
-                     if CATALOGUE[name].in_readings(parameter)
+                     if CATALOGUE[name].in_readings(parameter) and parameter not in OF_ONE
                      if not ignored('gap', name)
                      for key, value in zip(names_of(name, parameter), base_of(
                          CATALOGUE[name].parameters[parameter], given))}
+        self._play = np.broadcast_to(robot.effects.get('joint_backlash', {}).get('gap', 0.0), 4)
         self._kept: dict = {}
         third = np.abs(np.diff(values[JOINTS], 3, axis=0))
         self.reading_noise = float(np.median(np.sqrt((np.minimum(third, np.quantile(
@@ -184,13 +186,14 @@ class Signals:
     def joints(self, theta):
         """Angle, rate, acceleration (N, 4) of the tilts, and the raw reading (N, 4)."""
         theta = self._beyond_file(theta)
-        names = ['joint_feedback_delay.delay', 'joint_backlash.gap', IMU_LAG]
-        delay, gap, late = (theta.get(name, 0.0) for name in names)
+        names = ['joint_feedback_delay.delay', IMU_LAG, 'joint_backlash.gap', *PLAY]
+        delay, late, *more = (theta.get(name, 0.0) for name in names)
+        gap = np.maximum(self._play + more[0] + more[1:], 0.0)
 
         def make():
             fine = self._at(self._joint, delay - late)
             raw = self._smooth(fine, self.p.smooth_reading)
-            if gap > 0:
+            if gap.any():
                 fine = play(fine, gap / 2)
             if self.model_tilts is not None:
                 return *self._fused_tilts(self.model_tilts, raw, gap), raw
@@ -207,7 +210,7 @@ class Signals:
     def _fused_tilts(self, model_tilts, raw, gap):
         """Angle, rate, acceleration (N, 4): slow part from encoders, fast part from the model."""
         p, derivatives_of_model = self.p, self._model_derivatives
-        if gap > 0:
+        if gap.any():
             model_tilts = play(model_tilts, gap / 2)
             derivatives_of_model = derivatives(model_tilts, p.smooth_joint, p.grid)
         slow = [within(low_pass(p.guide_edge, 1, p.grid), raw - model_tilts, 0)]

@@ -18,9 +18,12 @@ from beetle_omni_ros.identify.flights.keys import (
     entries_of,
     Entry,
     extra_keys,
+    Key,
     keys_of,
     LIMITS,
     MODULES,
+    OF_ONE,
+    of_start,
     Prior,
     prior_of,
     SWING,
@@ -71,13 +74,13 @@ Then = Callable[[Engine, Solution, dict, Starts | None, list], dict]   # adds; l
 def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: RobotParameters,
            p: GapParameters, alpha: float = ALPHA, then: Then | None = None) -> dict:
     """Results of checked flights of bags; ``judging`` is held out. ``then`` may add to them."""
-    keys = {**all_keys(robot), **extra_keys()}
+    keys = {**all_keys(robot), **extra_keys(robot)}
     body = BodyModel(robot, keys, tilting_modules(robot))
     every = [BagFlight(flight, robot, body, keys, p) for flight in [*flights, *judging]]
     models, others = every[:len(flights)], every[len(flights):]
     late = first_point(models, every, robot)
-    starts = {name: own for name, own in _starts(keys, models).items()
-              if name.partition('@')[0] not in p.without}
+    starts = {name: own for name, own in starts_in(keys, models).items()
+              if of_start(name)[0] not in p.without}
     tangents = {f'{name}~{key}': (name, key) for name, start in starts.items() for key in start}
     for model in every:
         model.starts, model.tangents = starts, tangents
@@ -93,11 +96,14 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     priors |= {n: Prior(tolerance[n], key.typical, 0.0) for n, key in keys.items()
                if n in tolerance and n not in priors and key.effect not in p.without
                and (n != 'modules.share' or robot.multibody is not None)}
+    entries += [Entry(name, tuple(f'servo.{key}[{k}]' for key in TREATMENTS[name].sizes), k + 1,
+                      False) for name in sorted({*OF_ONE.values()} - {*LIMITS, *p.without})
+                for k in range(4)]
     for start, own in starts.items():
-        name, moved = start.partition('@')[0], [f'{start}~{key}' for key in own]
-        priors[start] = Prior(0.03, 1.0, 0.0)
+        (name, member), moved = of_start(start), [f'{start}~{key}' for key in own]
+        priors[start] = Prior(0.001 if member else 0.03, 1.0, 0.0)
         priors |= {tangent: Prior(0.001, 0.3, 0.0) for tangent in moved}
-        entries.append(Entry(name, (start, *moved), None, TREATMENTS[name].channels == 'B'))
+        entries.append(Entry(name, (start, *moved), member, TREATMENTS[name].channels == 'B'))
     bounds |= dict.fromkeys(starts, (0.0, np.inf)) | kept
     varying = {n: VARYING[n.partition('[')[0]] for n in priors if n.partition('[')[0] in VARYING}
     if len(models) > 1:
@@ -151,13 +157,17 @@ def first_point(models, every, robot):
     return late
 
 
-def _starts(keys, models):
-    """Name of a start -> deviations of the keys of its effect."""
+def starts_in(keys: dict[str, Key], models: Sequence[BagFlight]) -> Starts:
+    """Name of a start -> deviations of the keys of its effect, of all joints or of one."""
     result = {}
     for name in LIMITS:
         own = [key for key in keys.values() if key.effect == name and not key.form]
+        single = range(4) if own[0].parameter in OF_ONE else ()
         for k, start in enumerate(starts_of(own[0], models)):
             result[f'{name}@{k}'] = dict(zip([key.name for key in own], start, strict=True))
+            result |= {f'{name}[{j + 1}]@{k}': {
+                f'servo.{key.parameter}[{j}]': value
+                for key, value in zip(own, start, strict=True)} for j in single}
     return result
 
 
@@ -229,7 +239,7 @@ def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
     if not {'duty', 'thrust'} & set(declared.signals):
         raise ParameterError(f"--format {declared.name}: expected the key 'duty' or 'thrust'")
     keys = keys_of(robot, {*FORCES, *TORQUES, *SENSORS})
-    body = BodyModel(robot, {**all_keys(robot), **extra_keys()}, tilting_modules(robot))
+    body = BodyModel(robot, {**all_keys(robot), **extra_keys(robot)}, tilting_modules(robot))
     return [TableFlight(read_flight(path, declared), robot, body, keys) for path in paths]
 
 

@@ -14,6 +14,7 @@ HUBER = 3.0                 # standard deviations from which the loss is linear
 SIGMA_OF_MEDIAN = 1.4826    # standard deviation over the median of the size, normal distribution
 LEVELS = 10.0 ** np.arange(0, 5)    # tried variances of a drift
 CORNERS = (0.5, 2.0, 8.0)           # tried
+ROUNDED = 1e-9              # share of the largest eigenvalue below which one is rounding
 
 
 def huber(white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,3 +151,15 @@ def within_limits(low: float, high: float) -> tuple[float, float, float]:
             mean += density
             edge += x * density
     return chance, mean, min(max(1 + edge - mean * mean, 1e-6), 1.0)
+
+
+def positive(matrix: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, ...]:
+    """
+    Root R, its inverse, and R R' of a symmetric matrix (d, d), without directions of no size.
+
+    ``size`` (d,) makes the units equal: eigenvalues of size matrix size are at least ROUNDED.
+    """
+    values, vectors = np.linalg.eigh(0.5 * size[:, None] * (matrix + matrix.T) * size)
+    values = np.maximum(values, ROUNDED * max(values.max(), 1.0))
+    root = vectors * values**0.5 / size[:, None]
+    return root, (vectors * values**-0.5).T * size, root @ root.T
