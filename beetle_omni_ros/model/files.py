@@ -21,7 +21,8 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
     """
     Read columns of a CSV file, plain or compressed by gzip.
 
-    Blank lines, comments (#) and further columns are ignored. A column ``a`` whose cells are lists
+    Blank lines, comments (#) and further columns are ignored. The header may be the last comment
+    before the first row, as numpy.savetxt writes it. A column ``a`` whose cells are lists
     of numbers, as pandas writes arrays, is the columns ``a[0]``, ``a[1]`` and so on.
 
     Args:
@@ -49,8 +50,7 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
     except (OSError, EOFError, UnicodeDecodeError, csv.Error) as cause:
         reason = f"not a CSV text file ({getattr(cause, 'strerror', None) or cause})"
         raise ParameterError(f'{path}: {reason}') from None
-    lines = _spread([(number, row) for number, row in lines
-                     if any(row) and not row[0].startswith('#')])
+    lines = _spread(_with_header([(number, row) for number, row in lines if any(row)]))
     if not lines:
         raise ParameterError(f'{path}: empty; expected the header {expected}')
     number, header = lines.pop(0)
@@ -75,6 +75,16 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
     table = np.array(values).reshape(len(lines), len(names))
     return ({name: table[:, k] for k, name in enumerate(names)},
             np.array([line for line, _ in lines], dtype=int))
+
+
+def _with_header(lines):
+    """Lines that are no comments; before numbers alone, a comment of as many cells is a header."""
+    rows = [line for line in lines if not line[1][0].startswith('#')]
+    if not rows or not all(not cell or _is_number(cell) for cell in rows[0][1]):
+        return rows
+    before = [(number, row) for number, row in lines if number < rows[0][0]][-1:]
+    return [(number, [row[0].lstrip('# '), *row[1:]]) for number, row in before
+            if len(row) == len(rows[0][1])] + rows
 
 
 def _spread(lines):

@@ -15,9 +15,8 @@ from beetle_omni_ros import cli
 from beetle_omni_ros.identify.flights.command import gap_results
 from beetle_omni_ros.identify.flights.evidence import Judge, normal
 from beetle_omni_ros.identify.flights.spectrum import EDGES, spectrum
-from beetle_omni_ros.identify.flights.table_flight import wander
 from beetle_omni_ros.identify.flights.verdict import load_tables
-from beetle_omni_ros.identify.recording.series import turning
+from beetle_omni_ros.identify.recording.series import turning, wander
 from beetle_omni_ros.identify.recording.table import Format, read_flight
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import share_path
@@ -283,6 +282,74 @@ def test_a_wind_of_a_fifth_of_the_weight_is_not_taken_for_markers_that_are_turne
     assert np.allclose(force, [0.05, -0.03, 0.0], atol=0.004)
 
 
+def test_a_drag_that_too_few_blocks_show_is_no_unknown_force(tmp_path):
+    result = gap_of([write_flight(tmp_path / 'short.csv', 1, drag=0.03, seconds=22)])
+    assert result['verdict'] == 'not_decidable' and not result['effects']
+    assert 'rotor drag would explain' in result['reason']
+    assert named(gap_of([write_flight(tmp_path / 'long.csv', 1, drag=0.03)])) == {'rotor_drag'}
+
+
+HOVERING = """
+time: {columns: [t], unit: s}
+position: {columns: [px, py, pz], unit: m}
+velocity: {columns: [vx, vy, vz], unit: m/s}
+specific_force: {columns: [fx, fy, fz], unit: m/s^2}
+thrust: {columns: [u1, u2, u3, u4], unit: N}
+"""
+
+
+def write_hovering(path, seed, push, seconds=24.0, step=0.002):
+    """Level flight under feedback, which a wake pushes down by ``push`` of the weight at times."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0, seconds, step)
+    passes = np.cumsum(rng.uniform(2.5, 4.5, size=12))
+    wake = -push * np.exp(-0.5 * ((t[:, None] - passes) / 0.25)**2).sum(axis=1)
+    aim = 1 + 0.1 / 3 * sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (0.3, 0.8, 1.5))
+    noise = rng.normal(size=(2, len(t))) * [[1e-3], [1e-2]]
+    z, speed, thrust, total = 1.0, 0.0, 9.81, 0.0       # by the mass
+    rows = np.zeros((len(t), 4))
+    for k in range(len(t)):
+        error = aim[k] - z - noise[0, k]
+        total += error * step
+        command = 9.81 + 14 * error - 6 * (speed + noise[1, k]) + 6 * total
+        thrust += step / 0.06 * (command - thrust)
+        force = thrust + 9.81 * wake[k]
+        rows[k] = z, speed, force, 0.0319 * command
+        speed += step * (force - 9.81)
+        z += step * speed
+    rows, still = rows[::5], np.zeros((len(rows[::5]), 2))
+    felt = np.column_stack([still, rows[:, 2]]) + rng.normal(size=(len(rows), 3)) * 0.05
+    np.savetxt(path, np.column_stack([t[::5], still, rows[:, 0], still, rows[:, 1], felt, *(
+        4 * [rows[:, 3] / 4])]), delimiter=',', comments='', fmt='%.7g',
+        header='t,px,py,pz,vx,vy,vz,fx,fy,fz,u1,u2,u3,u4')
+    return path
+
+
+@pytest.mark.parametrize('seed', [135, 155])
+def test_the_answer_to_a_wake_is_no_effect_of_the_robot(tmp_path, seed):
+    form = tmp_path / 'hovering.yaml'
+    form.write_text(HOVERING)
+    flights = [write_hovering(tmp_path / f'{k}.csv', seed + k, push=0.3) for k in range(3)]
+    assert not named(gap_of(flights, str(form)))
+
+
+def test_a_thrust_that_the_rotors_cannot_deliver_does_not_count(tmp_path):
+    form = tmp_path / 'hovering.yaml'
+    form.write_text(HOVERING + 'voltage: {columns: [fx], unit: V}\n')
+    path = write_hovering(tmp_path / 'a.csv', 1, push=0.0)
+    cells = np.loadtxt(path, delimiter=',', skiprows=1)
+    cells[1000:1005, 12] = 0.17             # the file's rotors have 0.16 N
+    cells[:, 7] = np.linspace(4.2, 3.4, len(cells))     # stands for the voltage
+    np.savetxt(path, cells, delimiter=',', header=path.read_text().split('\n', 1)[0], comments='')
+    flight, = load_tables([path], RobotParameters.load(ROBOT), Format.load(str(form)))
+    at = flight.channels.index('force_z')
+    assert not flight.mask[1000:1005, at].any() and flight.mask[500:1000, at].all()
+    key = 'voltage_sag.exponent'
+    slope = -flight.linear({}, [key]).slopes[500:600, at, 0]
+    assert np.allclose(slope, 9.81 * np.log(flight.motion['voltage'][500:600]), rtol=0.2)
+    assert flight.motion['voltage'][[0, -1]] == pytest.approx([1.0, 3.4 / 4.2])
+
+
 def test_flights_of_the_robot_of_the_file_have_no_named_effect(tmp_path):
     flights = [write_flight(tmp_path / f'{k}.csv', 10 + k) for k in range(2)]
     result = gap_of(flights)
@@ -366,6 +433,16 @@ def test_flights_on_the_ground_and_other_channels_are_told_by_name(tmp_path):
     blind.write_text('\n'.join([lines[0], *(','.join([*c[:8], '', *c[9:]]) for c in cells[1:])]))
     with pytest.raises(ParameterError, match='blind.csv: its channels are force_y'):
         gap_of([good, blind])
+
+
+def test_hops_that_no_filter_can_use_are_told_and_no_error(tmp_path):
+    path = write_flight(tmp_path / 'hops.csv', 1, seconds=20)
+    cells = np.loadtxt(path, delimiter=',', skiprows=1)
+    cells[cells[:, 0] % 1.4 > 0.8, 14:18] = np.nan      # 0.5 s after a gap do not count
+    np.savetxt(path, cells, delimiter=',', header=HEADER, comments='')
+    path.write_text(path.read_text().replace('nan', ''))
+    result = gap_of([path])
+    assert result['verdict'] == 'bad_data' and 'has no block of commands' in result['reason']
 
 
 def test_duty_needs_a_robot_with_a_motor_map(tmp_path):

@@ -38,6 +38,30 @@ def test_units_signs_orders_and_directions_are_those_that_the_format_declares(tm
     assert np.allclose(table.values['duty'][0], [1, 0, 0, 0])
 
 
+def test_a_specific_force_in_world_is_turned_by_the_attitude_of_its_row(tmp_path):
+    path, world = tmp_path / 'flight.csv', FORMAT.replace('unit: g,', 'unit: g, frame: world,')
+    path.write_text(HEADER + rows(range(0, 200, 10)) + '200,0,0.5,1,,0.6,0,0,0,0,0,0\n')
+    forces = read_flight(path, declared(tmp_path, world)).values['specific_force']
+    # (0, -0.5, 1) g, and the world is turned in the body by 2 acos(0.8) about x
+    cosine, sine = 0.28, 0.96
+    expected = [0, -0.5 * cosine - sine, cosine - 0.5 * sine]
+    assert np.allclose(forces[:20] / 9.80665, expected) and np.isnan(forces[20]).all()
+    with pytest.raises(ParameterError, match="'quaternion' is missing: expected the attitude"):
+        declared(tmp_path, ''.join(line for line in world.splitlines(True) if 'wxyz' not in line))
+    with pytest.raises(ParameterError, match="expected one of body, world, found 'sky'"):
+        declared(tmp_path, FORMAT.replace('unit: g,', 'unit: g, frame: sky,'))
+
+
+def test_the_header_may_be_a_comment_as_numpy_writes_it(tmp_path):
+    path, numbers = tmp_path / 'flight.csv', np.arange(20)[:, None] * [10, *range(11)]
+    np.savetxt(path, numbers, delimiter=',', header='made by numpy\n' + HEADER.strip())
+    assert np.allclose(read_flight(path, declared(tmp_path)).values['duty'][3], [
+        21 / 65535, 24 / 65535, 27 / 65535, 30 / 65535])
+    np.savetxt(path, numbers, delimiter=',', header='made by numpy')
+    with pytest.raises(ParameterError, match='the header is missing'):
+        read_flight(path, declared(tmp_path))
+
+
 def test_a_single_column_needs_no_list_and_the_unit_1_no_quotes(tmp_path):
     form = declared(tmp_path, FORMAT.replace('[ms]', 'ms') + 'voltage: {columns: u, unit: mV}\n')
     assert form.signals['time'].columns == ('ms',) and form.signals['voltage'].columns == ('u',)

@@ -19,7 +19,7 @@ from beetle_omni_ros.identify.flights.body import BodyModel
 from beetle_omni_ros.identify.flights.keys import delays_of, Key, OF_ONE, of_start, TILT_BUS
 from beetle_omni_ros.identify.flights.servo import simulate, windows_of
 from beetle_omni_ros.identify.flights.signals import IMU_LAG, Signals
-from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear
+from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear, warm
 from beetle_omni_ros.identify.recording.bag import COMMAND, Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
 from beetle_omni_ros.identify.recording.series import low_pass, matrices, THIN, within
@@ -93,7 +93,7 @@ class BagFlight:
         far = self._poses.margin
         inside = (self.rows >= far) & (self.rows < len(self.signals.t) - far)
         self.mask[:, 6:12] = inside[:, None]
-        self.usable = len(blocks_of(self.mask, self.period)) > 0
+        self.usable = len(blocks_of(warm(self.mask, self.period), self.period)) > 0
 
     def _trusted(self):
         """(N,) whether a grid point is not at the rotor limit for its voltage, nor grounded."""

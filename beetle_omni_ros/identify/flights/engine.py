@@ -21,6 +21,8 @@ PAIRED = 20             # entries whose pairs are all weighed; others follow fro
 class Engine(Linearised):
     """Weighs sets of entries on several flights; arguments are those of its base."""
 
+    certain = False     # whether the scatter of the blocks is taken as known
+
     def run(self, first: dict[str, float] | None = None) -> Solution:
         """Relinearise, learn the noise and search, several times; ``first``: deviations there."""
         theta = np.zeros(len(self.names))
@@ -69,6 +71,18 @@ class Engine(Linearised):
         return self._with_plain(replace(
             solution, judge=judge, equations=judge.equations,
             posterior=judge.posterior(self.indices(chosen))))
+
+    def likely(self, solution: Solution) -> Solution:
+        """
+        The best set as if the scatter of the blocks were known.
+
+        Few blocks name nothing, because their scatter is uncertain. That does not exclude that an
+        entry explains what they show.
+        """
+        self.certain = True
+        found = self._with_plain(self._search(solution.spectra, solution.banned))
+        self.certain = False
+        return found
 
     def _with_plain(self, solution):
         solution.plain = self._weighing(solution.spectra, solution.banned,
@@ -228,5 +242,6 @@ class Engine(Linearised):
                      np.concatenate([self.bounds, np.tile([-np.inf, np.inf], (more, 1))]),
                      np.concatenate([self.kept, flat]),
                      np.concatenate([self.owner, np.full(more, len(self.entries))]),
-                     self.alpha / len(self.entries), np.concatenate([self.far, flat]),
+                     None if self.certain else self.alpha / len(self.entries),
+                     np.concatenate([self.far, flat]),
                      np.concatenate([self.acting, flat]))

@@ -177,7 +177,7 @@ class Judge:
         bounds: (K, 2) smallest and largest possible values.
         kept: (K,) keys of tolerances with bounds, which are part of every comparison.
         owner: (K,) index of the entry of each key.
-        level: probability at which the widening by few blocks holds.
+        level: probability at which the widening by few blocks holds; None: by their scatter alone.
         far: (K,) keys whose deviation may be much larger than typical; not those of sensors.
         acting: (K,) factors of effects that act at the point of linearisation. A set that has
             such an effect has it as linearised, with a factor of one.
@@ -185,7 +185,7 @@ class Judge:
     """
 
     def __init__(self, equations: Normal, narrow: np.ndarray, typical: np.ndarray,
-                 bounds: np.ndarray, kept: np.ndarray, owner: np.ndarray, level: float,
+                 bounds: np.ndarray, kept: np.ndarray, owner: np.ndarray, level: float | None,
                  far: np.ndarray, acting: np.ndarray):
         self.equations, self.narrow, self.typical = equations, narrow, typical
         self.bounds, self.kept = bounds.tolist(), kept
@@ -195,7 +195,7 @@ class Judge:
         self.mean = self.covariance @ equations.right
         self.blocks = len(equations.scores)
         self.owner, self.far, self.acting = owner, far, acting
-        self.student = few_blocks(level, self.blocks)
+        self.student = 1.0 if level is None else few_blocks(level, self.blocks)
         self._kept: dict[tuple[int, ...], Posterior] = {}
         self._profiles: dict[tuple[int, ...], tuple] = {}
 

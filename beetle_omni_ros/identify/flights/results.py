@@ -110,8 +110,9 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
         e, s, own, named, starts or {}, alpha / len(tests))]
     rest = unexplained(engine, solution) if measured else []
     fed_back = sorted(solution.entries[k].name.replace('_', ' ') for k in solution.banned)
+    likely = known_of(engine, solution, alpha) if not sets and repeating(rest, alpha) else []
     verdict, reason = verdict_of(chance, sets, rest, fed_back, alpha, max(
-        (effect['evidence']['ln_bayes_factor'] for effect in effects), default=0.0))
+        (effect['evidence']['ln_bayes_factor'] for effect in effects), default=0.0), likely)
     return result_of(
         verdict, {**groups, **{kind: groups[kind] | {'reason': STILL}
                                for kind in engine.without_motion}}, reason,
@@ -124,7 +125,7 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
         where=where_of(engine, solution), false_alarm_probability=chance,
         held_out=held_out, findings=[*findings, *varied(engine, solution), *(
             test.sentence[:1].upper() + test.sentence[1:] for test in rest
-            if test.probability < alpha / TESTS and verdict != 'unknown')],
+            if test.probability < alpha / TESTS and verdict != 'unknown' and not likely)],
         **numbers_of(engine, solution, taken[0] if verdict in NAMING else [], judges))
 
 
@@ -174,6 +175,23 @@ def effect_of(solution: Solution, engine: Engine, keys: dict[str, Key], k: int,
                    'parameters': sizes(j)} for j in members[1:]]:
         result['rivals'] = rivals
     return result
+
+
+def repeating(rest: list[Unexplained], alpha: float) -> bool:
+    """Whether a test shows what no entry of the best set explains."""
+    return bool(rest) and rest[0].probability < alpha / TESTS
+
+
+def known_of(engine: Engine, solution: Solution, alpha: float) -> list[str]:
+    """
+    Entries that explain what repeats, although too few blocks show them for a name.
+
+    Empty if it repeats beside the most likely entries as well.
+    """
+    likely = engine.likely(solution)
+    if set(likely.best) <= set(solution.best) or repeating(unexplained(engine, likely), alpha):
+        return []
+    return list(dict.fromkeys(likely.entries[k].name for k in likely.best))
 
 
 def of_a_rotor(effect: dict, slow: list[dict]) -> bool:
@@ -322,7 +340,8 @@ def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: li
 
 
 def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
-               fed_back: list[str], alpha: float, evidence: float) -> tuple[str, str]:
+               fed_back: list[str], alpha: float, evidence: float,
+               likely: Sequence[str] = ()) -> tuple[str, str]:
     """
     Verdict on flights and, without names, its reason as the end of a sentence.
 
@@ -333,19 +352,23 @@ def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
         fed_back: entries that were excluded because of feedback.
         alpha: accepted probability of a false alarm.
         evidence: of the surest of the named entries [nat].
+        likely: entries that explain what repeats, but are not sure enough.
 
     """
     if len(fed_back) > MOST_FED_BACK:
         return 'not_decidable', (
             'the controller answers noise more than it flies: the values of '
             f"{', '.join(fed_back)} differ between frequencies")
-    repeats = bool(rest) and rest[0].probability < alpha / TESTS
+    repeats = repeating(rest, alpha)
     small = [len(members) for members in sets if len(members) < CROWD]
     if small and not (repeats and evidence < MINOR * rest[0].gain):
         return 'named_set' if max(small) > 1 else 'named', ''
     if sets and not small:
         return 'not_decidable', (
             f"they do not separate {' and '.join(map(' or '.join, sets))}".replace('_', ' '))
+    if repeats and likely:
+        return 'not_decidable', (f"{' and '.join(likely)} would explain what repeats, but too few "
+                                 'blocks show it'.replace('_', ' '))
     if repeats:
         return 'unknown', rest[0].sentence
     if chance > alpha:

@@ -219,8 +219,7 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
         filters: (C, L) whitening filters; None: the noise differs between bands.
 
     """
-    weight = mask if filters is None else np.stack(
-        [_known(own, int(WARM / period)) for own in mask.T], axis=1)
+    weight = mask if filters is None else warm(mask, period)
     rows = blocks_of(weight, period)
     weight, size = weight[rows], rows.shape[1]
     frequency = np.arange(size) / (2 * size * period)
@@ -247,6 +246,11 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
     counts = [int((frequency[used] <= highest[channels[0]]).sum()) for channels in groups]
     return Spectrum(coefficients, parts, slopes.shape[2], band, noise, floor, counts,
                     0.5 / (size * period), filters is not None)
+
+
+def warm(mask: np.ndarray, period: float) -> np.ndarray:
+    """(N, C) samples of filtered channels that count."""
+    return np.stack([_known(own, int(WARM / period)) for own in mask.T], axis=1)
 
 
 def _known(mask, warm):

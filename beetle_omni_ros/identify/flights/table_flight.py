@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.flights.body import BodyModel
 from beetle_omni_ros.identify.flights.keys import Key, names_of
-from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear
+from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear, warm
 from beetle_omni_ros.identify.recording.series import (
     aligned,
     along,
@@ -29,6 +29,7 @@ from beetle_omni_ros.identify.recording.series import (
     rising,
     slow,
     turning,
+    wander,
 )
 from beetle_omni_ros.identify.recording.table import Table
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -52,9 +53,6 @@ TILTS = 20.0            # [Hz] edge of the filter of tilts: servos are slower
 NEEDED = {'position': 'position', 'quaternion': 'quaternion', 'specific_force': 'accelerometer',
           'angular_velocity': 'gyroscope'}
 DELAYS = ('rotor_dead_time.delay', 'command_latency.delay')
-WINDOW = 2.0        # [s] in which one shift of two clocks is measured
-REACH = 0.15        # [s] largest shift
-LEAST = 3           # windows of which the scatter can be known
 
 
 @dataclass(eq=False)
@@ -116,7 +114,9 @@ class TableFlight:
         values = self.table.values
         name = 'duty' if 'duty' in values else 'thrust'
         command, known = filled(values[name], self.period)
-        if name == 'duty':
+        if name == 'thrust':    # more is commanded than the rotors deliver
+            known &= (command <= self.robot.rotors.thrust_max).all(axis=1)
+        else:
             known &= values[name].max(axis=1, initial=0, where=np.isfinite(values[name])) < FULL
             self._volts = filled(values['voltage'], self.period)[0][:, 0] if (
                 'voltage' in values) else np.full(len(command), self._motor.nominal_voltage)
@@ -166,9 +166,16 @@ class TableFlight:
         inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': rate, 'tilt': tilt[0],
                   'thrust': self._thrust({})[0], 'tilt_rate': tilt[1],
                   'tilt_acceleration': tilt[2], 'thrust_rate': np.zeros((n, 4)),
-                  'position': position, 'voltage': np.ones(n), 'modules': np.ones(n),
+                  'position': position, 'voltage': self._charge(), 'modules': np.ones(n),
                   **{f'state of {name}': np.zeros((n, 4)) for name in self.body.slow}}
         return inputs, np.concatenate([force, turned], axis=1), reasons
+
+    def _charge(self):
+        """(N,) pack over full voltage; with duty, the voltage acts in the motor map instead."""
+        v = self.table.values
+        ratio = filled(v['voltage'], self.period)[0][:, 0] / self.robot.battery.full_voltage \
+            if {'thrust', 'voltage'} <= set(v) else np.ones(len(self.table))
+        return ratio if 0.5 < ratio.min() and ratio.max() < 1.5 else np.ones(len(ratio))
 
     def _force_by_mocap(self, position, rotation):
         """(N, 3) specific force of positions and attitudes; NaN: they are not measured."""
@@ -239,7 +246,8 @@ class TableFlight:
     @property
     def usable(self) -> bool:
         """Whether it has a block of samples in the air."""
-        return bool(self.channels) and len(blocks_of(self.mask, self.period)) > 0
+        return bool(self.channels) and len(blocks_of(
+            warm(self.mask, self.period), self.period)) > 0
 
     def without(self, groups: tuple[str, ...], reason: str) -> None:
         """Leave groups of channels out, for this ``reason``."""
@@ -367,33 +375,3 @@ def poses(table, far):
             position, quaternion = (np.stack([np.interp(t + late, t, c) for c in x.T], axis=1)
                                     for x in (position, quaternion))
     return position, quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), deviation
-
-
-def wander(seen, felt, known, period):
-    """
-    Shift of the clock of one series against that of another, by windows.
-
-    Args:
-        seen: (N, 3) rates of the attitude [rad/s].
-        felt: (N, 3) rates of the gyroscope.
-        known: (N,) samples that count.
-        period: of the samples [s].
-
-    Returns:
-        by how much ``seen`` is late in the median, and the RMS deviation of the windows from it
-        [s]; NaN and infinity if too few windows show it.
-
-    """
-    reach, length = int(REACH / period), int(WINDOW / period)
-    steps, found = np.arange(-reach, reach + 1), []
-    for first in range(reach, len(seen) - length - reach, length):
-        rows = first + np.flatnonzero(known[first:first + length])
-        cost = np.array([((seen[rows + k] - felt[rows])**2).sum() for k in steps])
-        best = int(cost.argmin())
-        if len(rows) > length / 2 and 0 < best < len(steps) - 1:
-            before, here, after = cost[best - 1:best + 2]
-            found.append((steps[best] + 0.5 * (before - after) / (before - 2 * here + after))
-                         * period)
-    if len(found) < LEAST:
-        return np.nan, np.inf
-    return float(np.median(found)), float(np.sqrt(np.mean((found - np.median(found))**2)))

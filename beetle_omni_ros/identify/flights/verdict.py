@@ -39,6 +39,7 @@ from beetle_omni_ros.identify.flights.signals import IMU_LAG
 from beetle_omni_ros.identify.flights.table_flight import (
     by_mocap,
     COMPARED,
+    DELAYS,
     GROUPS,
     TableFlight,
 )
@@ -215,7 +216,10 @@ def _engine(flights, robot, p, declared, alpha):
         priors |= {name: replace(priors[name], narrow=priors[name].typical)
                     for name, key in keys.items() if key.effect in LAGS}
         entries = [entry for entry in entries if entry.name not in LAGS]
-    return Engine(flights, priors, entries, bounds, far, alpha), keys
+    # no servo is simulated from commands, so that every entry acts where feedback answers noise
+    entries = [replace(entry, in_loop=True) for entry in entries]
+    clock = next((name for name in DELAYS if name in priors), '')
+    return Engine(flights, priors, entries, bounds, far, alpha, clock=clock), keys
 
 
 def estimated(declared: Format) -> bool:

@@ -15,6 +15,9 @@ THIN = 2            # decimation of the grid for the body equations
 BRIDGED = 0.06      # [s] gaps of inputs that interpolation bridges, about a rotor lag
 SMOOTH = 0.05       # [s] moving average of positions before their derivative
 EDGE = 1.0          # [s] at both ends, for smoothing and history
+WINDOW = 2.0        # [s] in which one shift of two clocks is measured
+REACH = 0.15        # [s] largest shift
+LEAST = 3           # windows of which the scatter can be known
 STENCILS = (1.0,), (0.5, 0.0, -0.5), (1.0, -2.0, 1.0)     # of derivatives
 
 
@@ -187,3 +190,33 @@ def along(thrust, yaw):
     matrix = np.stack([np.cross(y, z), y, z], axis=2)
     matrix[~np.isfinite(matrix).all(axis=(1, 2))] = np.eye(3)
     return Rotation.from_matrix(matrix).as_quat()
+
+
+def wander(seen, felt, known, period):
+    """
+    Shift of the clock of one series against that of another, by windows.
+
+    Args:
+        seen: (N, 3) rates of the attitude [rad/s].
+        felt: (N, 3) rates of the gyroscope.
+        known: (N,) samples that count.
+        period: of the samples [s].
+
+    Returns:
+        by how much ``seen`` is late in the median, and the RMS deviation of the windows from it
+        [s]; NaN and infinity if too few windows show it.
+
+    """
+    reach, length = int(REACH / period), int(WINDOW / period)
+    steps, found = np.arange(-reach, reach + 1), []
+    for first in range(reach, len(seen) - length - reach, length):
+        rows = first + np.flatnonzero(known[first:first + length])
+        cost = np.array([((seen[rows + k] - felt[rows])**2).sum() for k in steps])
+        best = int(cost.argmin())
+        if len(rows) > length / 2 and 0 < best < len(steps) - 1:
+            before, here, after = cost[best - 1:best + 2]
+            found.append((steps[best] + 0.5 * (before - after) / (before - 2 * here + after))
+                         * period)
+    if len(found) < LEAST:
+        return np.nan, np.inf
+    return float(np.median(found)), float(np.sqrt(np.mean((found - np.median(found))**2)))

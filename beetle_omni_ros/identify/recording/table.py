@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.model.files import LogError, read_table
 from beetle_omni_ros.model.resources import share_path
@@ -40,7 +41,7 @@ SIGNALS: dict[str, tuple[int, dict[str, float]]] = {
     'attitude_target': (3, {'rad': 1.0, 'deg': math.pi / 180})}
 # Signal -> frames that it may have, the first one by default.
 FRAMES = {'position': ('world',), 'velocity': ('world', 'body'), 'acceleration': ('world',),
-          'quaternion': ('body_to_world', 'world_to_body'), 'specific_force': ('body',),
+          'quaternion': ('body_to_world', 'world_to_body'), 'specific_force': ('body', 'world'),
           'angular_velocity': ('body',), 'target_position': ('world',)}
 ORDERS = {'xyzw': (0, 1, 2, 3), 'wxyz': (1, 2, 3, 0)}
 
@@ -99,7 +100,15 @@ class Format:
             raise ParameterError(f"{path}: key 'time' is missing: expected the column of the time")
         if 'thrust' in signals and 'duty' in signals:
             raise ParameterError(f"{path}: expected 'thrust' or 'duty', found both")
+        if 'quaternion' not in signals and turned_to_world(signals):
+            raise ParameterError(f"{path}: key 'quaternion' is missing: expected the attitude "
+                                 "that turns 'specific_force' from world to body")
         return cls(name, signals, deviation)
+
+
+def turned_to_world(signals: dict[str, Signal]) -> bool:
+    """Whether an estimator has turned the accelerometer by the attitude of the same row."""
+    return 'specific_force' in signals and signals['specific_force'].frame == 'world'
 
 
 def _signal(name, content, path):
@@ -116,7 +125,7 @@ def _signal(name, content, path):
              f'{width} names (null: not recorded)'),
             ('sign', len(made.sign) in (1, width) and (abs(made.sign) == 1).all(),
              f'{width} of 1 or -1'),
-            *((key, getattr(made, key) in known, f"one of {', '.join(known)}")
+            *((key, getattr(made, key) in known, f"one of {', '.join(filter(None, known))}")
               for key, known in (('unit', units), ('frame', ('', *FRAMES.get(name, ()))),
                                  ('order', ORDERS)))):
         if not fits:
@@ -167,6 +176,8 @@ def read_flight(path: Path, form: Format) -> Table:
         block = block * signal.sign * SIGNALS[name][1][signal.unit] / signal.full
         block = block[:, ORDERS[signal.order]] if name == 'quaternion' else block
         values[name] = block * [-1, -1, -1, 1] if signal.frame == 'world_to_body' else block
+    if turned_to_world(form.signals):
+        values['specific_force'] = _in_body(values['specific_force'], values['quaternion'])
     t = values.pop('time')[:, 0]
     if len(t) < 10 or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
         raise LogError(f'{path}: column {form.signals["time"].columns[0]!r}: expected at least 10 '
@@ -178,6 +189,13 @@ def read_flight(path: Path, form: Format) -> Table:
         on_grid[name] = np.full((place[-1] + 1, block.shape[1]), np.nan)
         on_grid[name][place] = block
     return Table(path.name, period, on_grid, form)
+
+
+def _in_body(vectors, quaternion):
+    there = np.isfinite(quaternion).all(axis=1) & quaternion.any(axis=1)
+    body = np.full(vectors.shape, np.nan)
+    body[there] = Rotation.from_quat(quaternion[there]).inv().apply(vectors[there])
+    return body
 
 
 def _wanted(form, header):
