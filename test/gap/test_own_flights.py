@@ -40,7 +40,7 @@ def test_late_tilt_commands_and_modules_that_load_the_servos_are_named_and_nothi
     file['joints']['inertia'] = 5e-5
     robot.write_text(yaml.safe_dump(file))
     effects = {effect['names'][0]: effect['parameters'] for effect in gap(
-        flown(tmp_path, 'random4', [1], plant=plant), robot=robot)['effects']}
+        flown(tmp_path, 'random3', plant=plant), robot=robot)['effects']}
     assert set(effects) == {'module_reaction', 'joint_command_latency'}
     # the emulated bus acts in ticks of 5 ms
     assert effects['joint_command_latency']['delay']['value'] == pytest.approx(0.010, abs=0.003)

@@ -68,7 +68,7 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
     they would explain the noise of these flights. The last fit adapts the named entries and the
     discrepancy to these flights. Their own deviations are fitted within their priors in each case.
     The noise is that of the fitted flights. A deviation counts by its size over its prior, too, so
-    that no flight takes a named effect as its own; sensors that are named are those of all flights.
+    that no flight takes a named effect as its own. Named sensors are those of all flights.
     """
     generic = np.zeros(len(engine.names) - engine.known)
     theta = np.concatenate([solution.theta[:engine.known], generic])
