@@ -17,6 +17,7 @@ from beetle_omni_ros.identify.flights.next_flight import (
     Explanation,
     flat_flight,
     information,
+    log_density,
     Outlook,
     Planner,
     posterior_of,
@@ -72,6 +73,13 @@ def test_the_probability_of_a_decision_is_that_of_simulated_measurements():
         ratio = densities[k].logpdf(z) - densities[1 - k].logpdf(z)
         assert chances[k] == pytest.approx([(ratio > np.log(20)).mean(),
                                             (ratio < -np.log(20)).mean()], abs=0.03)
+
+
+def test_a_density_that_is_very_wide_in_one_direction_has_the_noise_in_the_others():
+    wide, across = np.linalg.qr(np.random.default_rng(3).normal(size=(30, 2)))[0].T
+    covariance = 1e12 * np.outer(wide, wide) + np.eye(30)
+    found = log_density(np.array([np.zeros(30), 3 * across, 1e6 * wide]), np.zeros(30), covariance)
+    assert found - found[0] == pytest.approx([0, -4.5, -0.5], abs=1e-3)
 
 
 @pytest.mark.parametrize('verdict', ['named', 'no_gap', 'unknown'])

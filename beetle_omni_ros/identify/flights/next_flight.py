@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
-from scipy.stats import multivariate_normal
 
 from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.flights.bag_flight import BagFlight
@@ -29,7 +29,7 @@ from beetle_omni_ros.identify.flights.results import member_of, named_of, parame
 from beetle_omni_ros.identify.flights.spectrum import pooled
 from beetle_omni_ros.identify.flights.table_flight import TableFlight
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
-from beetle_omni_ros.identify.inference.noise import few_blocks
+from beetle_omni_ros.identify.inference.noise import few_blocks, positive
 from beetle_omni_ros.identify.recording.bag import recording_of
 from beetle_omni_ros.identify.recording.flight import prepare, UnusableFlight
 from beetle_omni_ros.identify.recording.parameters import GapParameters
@@ -136,8 +136,7 @@ class Outlook:
         least, found = log(1 / self._engine.alpha), []
         for k, (mean, covariance) in enumerate(moments):
             z = rng.multivariate_normal(mean, covariance, SAMPLES, method='cholesky')
-            odds = self.odds + np.stack([multivariate_normal.logpdf(z, *own)
-                                         for own in moments], axis=1)
+            odds = self.odds + np.stack([log_density(z, *own) for own in moments], axis=1)
             order = np.sort(odds, axis=1)
             sure = order[:, -1] - order[:, -2] > least
             right = odds.argmax(axis=1) == k
@@ -175,13 +174,19 @@ class Sight:
     def _chance(self, covariance, c):
         """Probability that the evidence for a deviation of the keys ``c`` suffices."""
         own = self._engine.narrow[c]
-        values, vectors = np.linalg.eigh(
-            np.linalg.inv(covariance[np.ix_(c, c)]) - np.diag(own**-2))
-        null = (vectors / np.maximum(values, 1e-9 * own.min()**-2)) @ vectors.T + np.diag(own**2)
+        _, less, _ = positive(np.linalg.inv(covariance[np.ix_(c, c)]) - np.diag(own**-2), own)
+        null = less.T @ less + np.diag(own**2)
         wide = null + np.diag(self._engine.typical[c]**2)
-        z = np.random.default_rng(0).multivariate_normal(np.zeros(len(c)), wide, SAMPLES)
-        gain = multivariate_normal.logpdf(z, cov=wide) - multivariate_normal.logpdf(z, cov=null)
-        return (gain > self._least).mean()
+        none = np.zeros(len(c))
+        z = np.random.default_rng(0).multivariate_normal(none, wide, SAMPLES)
+        return (log_density(z, none, wide) - log_density(z, none, null) > self._least).mean()
+
+
+def log_density(z: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """(N,) ln of the normal density at z (N, r), but for a constant; it may be very narrow."""
+    lower = np.linalg.cholesky(covariance)
+    white = solve_triangular(lower, (z - mean).T, lower=True)
+    return -0.5 * (white**2).sum(axis=0) - np.log(np.diag(lower)).sum()
 
 
 def grams_of(engine: Engine, solution: Solution, flight: Any) -> np.ndarray:
