@@ -10,7 +10,6 @@ command continues a run. A case depends on its number and the seed alone.
 import argparse
 from collections import namedtuple
 from functools import partial
-from itertools import count, islice
 from pathlib import Path
 
 from formulas import attempted, described, hidden, OF_ONE, swept
@@ -98,19 +97,14 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--cases', type=int, default=65)
-    parser.add_argument('--kinds', default=','.join(KINDS), help='only these')
     parser.add_argument('--case', type=int, help='only the one with this number, in full')
     parser.add_argument('--jobs', type=int, help='at a time (every core)')
     parser.add_argument('--out', type=Path, default=Path('runs_out/gap_own.json'),
                         help='results; finished cases are kept in a folder beside it')
     given, console = parser.parse_args(), Console(width=140)
-    kinds = given.kinds.split(',')
-    if not set(kinds) <= set(KINDS):
-        parser.error(f"--kinds {given.kinds}: expected some of {', '.join(KINDS)}")
     if given.case is not None:
         return console.print_json(data=attempted(examined, case_of(given.seed, given.case)))
-    cases = list(islice((case for number in count() if (
-        case := case_of(given.seed, number)).kind in kinds), given.cases))
+    cases = [case_of(given.seed, number) for number in range(given.cases)]
     rows = swept(partial(attempted, examined), cases, given, console, line)
     scored = [row for row in rows if 'failure' not in row]
     score = [row for row in criteria(scored, 'hard', 'exact')
