@@ -71,7 +71,7 @@ def test_lags_of_rotors_far_beyond_their_tolerance_are_unknown_where_no_entry_ha
     plant.write_text('extends: robot.yaml\neffects: {rotor_lag: {time_constant: 0.06}}\n')
     less.write_text('without: [rotor_lag]\n')
     result = gap(flown(tmp_path, 'random2', plant=plant), parameters=less)
-    assert result['verdict'] == 'unknown' and 'of the lag of rotor' in result['reason']
+    assert result['verdict'] == 'unknown' and 'explains the lag of rotor' in result['reason']
 
 
 FORMAT = """

@@ -290,13 +290,16 @@ def beyond(engine: Engine, solution: Solution) -> Unexplained:
     most, k = float(np.abs(sizes).max()), own[int(np.argmax(np.abs(sizes)))]
     effect, _, index = engine.names[k].rstrip(']').partition('[')
     place = int(index or 0)
-    words = {'rotor.lag': f'the lag of rotor {place + 1} (ln of the ratio to the file)',
-             'position.offset': f"the {'xyz'[place % 3]} of rotor {place // 3 + 1} [m]",
-             'modules.share': 'the share of the tilting modules in the file'}
+    off, percent = float(solution.theta[k]), float(100 * np.expm1(solution.theta[k]))
+    what, size = {
+        'rotor.lag': (f'the lag of rotor {place + 1}', f'{percent:.2g} %'),
+        'position.offset': (f"the {'xyz'[place % 3]} of rotor {place // 3 + 1}",
+                            f'{1000 * off:.2g} mm'),
+        'modules.share': ('the effect of the tilting modules', f'{100 * off:.2g} %'),
+    }.get(effect, (effect, f'{off:.2g}'))
     return Unexplained(
         'tolerance', min(1.0, len(own) * float(chi2.sf(most**2, 1))), float(sizes @ sizes) / 2, (),
-        number=f'a deviation of {solution.theta[k]:.2g} of {words.get(effect, effect)}, '
-        f'{most:.0f} standard deviations of its tolerance')
+        number=f'{what}, which is off by {size}, {most:.0f} standard deviations of its tolerance')
 
 
 def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
