@@ -388,7 +388,7 @@ def test_a_late_clock_of_mocap_is_measured_and_taken_out(tmp_path, late):
     found, deviation = wander(seen, felt, np.ones(len(table), dtype=bool), 0.01)
     assert found == pytest.approx(late, abs=0.004) and deviation < 0.015
     flight, = load_tables([path], model, form)
-    away = flight._seen[200:-200, 3:] - flight._measured[200:-200, -3:]
+    away = flight._seen[200:-200, 3:] - flight.measured({})[200:-200, -3:]
     assert not flight.apart and away.std() < 0.2 * felt.std()
 
 

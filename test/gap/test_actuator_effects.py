@@ -63,7 +63,8 @@ SERVO = {'delay': 0.010, 'kp': JOINT.kp, 'kd': JOINT.kd, 'speed': JOINT.velocity
          'effort': JOINT.effort_limit, 'coulomb': 0.0, 'stiction': 0.0, 'bend': 0.0,
          'fading': 1e-3}
 FLOWN = [*(case[0] for case in CASES), *({'coulomb': 0.007, 'stiction': 0.010, 'fading': fading}
-         for fading in (0.03, 0.1)), {'effort': 0.05}, {'delay': 0.036}, {}]
+         for fading in (0.03, 0.1)), {'effort': 0.05}, {'delay': 0.036},
+         {'kp': 0.6, 'kd': 0.006}, {}]
 
 
 def servo(**changes):
@@ -230,6 +231,17 @@ def test_the_gains_of_one_servo_are_recovered():
     found = solved(one_servo(kp=0.26, kd=0.011), names, 'J', None, None, 6)
     assert [KEYS[name].value(found[name]) for name in names] == pytest.approx(
         [0.26, 0.011, JOINT.kp], abs=0.02)
+
+
+def test_values_do_not_move_when_they_are_linearised_again():
+    names = 'servo.kp[2]', 'servo.kd[2]'
+    engine = Engine([one_servo(kp=0.6, kd=0.006)] * 4, dict.fromkeys(names, Prior(0.03, 0.3, 0.0)),
+                    [Entry('joint_bandwidth', names, 3, False)])
+    solution = engine.run()
+    assert solution.best == (0,)
+    again = engine.again(solution, solution.best)
+    deviation = np.sqrt(np.diag(again.posterior.covariance))
+    assert (np.abs(again.theta[:2] - solution.theta[:2]) < 0.5 * deviation).all()
 
 
 @pytest.mark.parametrize(('made', 'joint'), [

@@ -176,7 +176,7 @@ class BagFlight:
                     for name, (start, key) in self.tangents.items()
                     if start in own and name in names}
         keys = list(dict.fromkeys(key for key, _ in factors.values()))
-        of_keys = self._slopes(theta, now, keys)
+        of_keys = self._slopes(theta, now, keys) if keys else slopes
         for k, name in enumerate(names):
             if like.get(name):
                 joint = PLACE['J'].start + (of_start(name)[1] or 0) - 1
@@ -186,14 +186,14 @@ class BagFlight:
                 behind, ahead = (
                     now if end == theta and self.signals.model_tilts is None
                     else self._guided(end, groups) for end in ends[name])
+                part = own.get(name, 1.0)
                 for group in groups:
-                    slopes[:, PLACE[group], k] = (ahead[group] - behind[group]) \
-                        / own.get(name, 1.0)
+                    slopes[:, PLACE[group], k] = (ahead[group] - behind[group]) / part
             elif name in factors:
                 key, part = factors[name]
                 slopes[:, :, k] = part * of_keys[:, :, keys.index(key)]
         self._runs = {}
-        return Linear(residual, slopes, self._measured(theta))
+        return Linear(residual, slopes)
 
     def _guided(self, theta, groups):
         """Residual with the tilts of the servo model at ``theta``, where they are of a model."""
@@ -208,9 +208,9 @@ class BagFlight:
         self.signals.use_model_tilts(before)
         return result
 
-    def _measured(self, theta):
-        """(M, 16) measurements of the channels."""
-        force, rate, turning = self.signals.imu(theta)
+    def measured(self, theta: dict[str, float]) -> np.ndarray:
+        """(M, 16) measurements of the channels at deviations ``theta``."""
+        force, rate, turning = self.signals.imu(theta := self._real(theta)[0])
         world = np.einsum('nij,nj->ni', matrices(self.signals.pose(theta)[1]), force)
         world[:, 2] -= self.robot.gravity
         body = np.concatenate([force, turning], axis=1)

@@ -12,7 +12,8 @@ from beetle_omni_ros.identify.flights.evidence import Judge, log_prior, normal, 
 from beetle_omni_ros.identify.flights.linearised import FORM, GROUPS, Linearised
 from beetle_omni_ros.identify.flights.spectrum import EDGES, Spectrum
 
-ROUNDS, MOST_ROUNDS = 3, 6      # linearisations; more until the best set and its values stay
+ROUNDS, MOST_ROUNDS = 3, 6      # linearisations of a given set; of one that is searched at most
+STAYS = 0.25            # of its standard deviation: a smaller step of a value changes no interval
 NEAR_START = 0.1        # share of a start within which an effect without a slope is nearly linear
 MOST = 8                # entries of a set
 PAIRED = 20             # entries whose pairs are all weighed; others follow from the best set
@@ -29,22 +30,23 @@ class Engine(Linearised):
         for name, value in (first or {}).items():
             theta[self.index[name]] = value
         etas = np.zeros((len(self.flights), len(self.names)))
-        self._whiten(theta, etas)
+        spectra: list[Spectrum] = self._whiten(theta, etas)
         self.only_acting = False
-        spectra: list[Spectrum] = []
-        best, turn = None, 0
+        best: tuple[int, ...] | None = None
+        turn = 0
         while True:
             turn += 1
             spectra = self._linearised(theta, etas, spectra)
             solution = self._steady(spectra)
-            own = self.indices(solution.best)
-            stays = solution.best == best and (
-                np.abs(solution.theta[own] - theta[own]) <= self.typical[own])[
-                    ~self.curved[own]].all()
-            if turn == MOST_ROUNDS or turn >= ROUNDS and stays:
-                return self._with_plain(self._acting(solution))
-            best = solution.best
-            theta, etas = self._next(solution)
+            own = sorted(self.indices(solution.best))
+            step = np.abs(solution.theta[own] - theta[own])
+            stays = (step <= STAYS * np.sqrt(np.diag(solution.posterior.covariance))).all()
+            same, best = solution.best == best, solution.best
+            if turn < MOST_ROUNDS and not (same and stays):
+                theta, etas = self._next(solution)
+                if self.part or not same:
+                    continue
+            return self._with_plain(self._acting(solution))
 
     def _acting(self, solution):
         """

@@ -147,12 +147,14 @@ class Linearised:
         self.flight = np.concatenate([self.flight, np.zeros(size)])
 
     def _whiten(self, theta, etas):
-        """Make the filters of these flights, and one for others, from the noise at a point."""
+        """Make the filters of these flights, and one for others, at a point; spectra there."""
         self._settle(theta, etas)
         self._learn(spectra := self._spectra(theta, etas))
         self.filters = [self._filter(s, s.noise) for s in spectra]
         self.common = self._filter(max(spectra, key=lambda s: s.band[-1]), pooled(spectra))
-        self.still = self._without_motion(theta, etas)
+        spectra = self._spectra(theta, etas)
+        self.still = self._without_motion(spectra, theta, etas)
+        return spectra
 
     @property
     def without_motion(self) -> list[str]:
@@ -167,7 +169,7 @@ class Linearised:
                  for kind in IN_LOOP}
         return [(kind, own) for kind, own in found.items() if own]
 
-    def _without_motion(self, theta, etas):
+    def _without_motion(self, spectra, theta, etas):
         """
         Bands and channels of each flight in which noise hides the motion, but for the mean.
 
@@ -176,12 +178,11 @@ class Linearised:
         robot turns, what the model leaves is no noise, and counts. Joints may rest there, and
         the noise of their readings, which is known, hides them.
         """
-        spectra = self._spectra(theta, etas)
         fit, equations = self._learn(spectra)
         found = []
         for k, (flight, each) in enumerate(zip(self.flights, spectra, strict=True)):
-            measured = self._linear(flight, self._at(k, theta + etas[k])).measured
-            whole = self.transformed(k, measured).residual
+            values = dict(zip(self.names, self._at(k, theta + etas[k]), strict=False))
+            whole = self.transformed(k, flight.measured(values)).residual
             rest = each.at(fit + equations.of_flight(k, fit))
             bands = {kind: self._hidden(each, own, rest, whole) for kind, own in self._in_loop()}
             if not flight.turning:      # what the model lacks is more than the noise
@@ -208,7 +209,7 @@ class Linearised:
         return whitening(power, self.flights[0].period)
 
     def _linearised(self, theta, etas, before):
-        """Spectra at a point; their noise begins at that of the spectra ``before``, if any."""
+        """Spectra at a point; their noise begins at that of the spectra ``before``."""
         self._settle(theta, etas)
         self.acting, self.point = self.curved & (theta[:self.known] == 1), theta
         spectra = self._spectra(theta, etas)
@@ -217,7 +218,7 @@ class Linearised:
         self.narrow[self.known:] = self.start[self.known:]
         for each, last in zip(spectra, before, strict=False):
             each.noise = last.noise
-        self._learn(spectra, 2 if before else 5)
+        self._learn(spectra, 2)
         return spectra
 
     def _restarted(self, theta, etas, spectra):
@@ -225,11 +226,12 @@ class Linearised:
         The point ``theta``, with starts moved to their fitted values, or a part of the way there.
 
         A secant is valid up to its start, and a slope for typical sizes. If the step is larger,
-        that part of it is made which leaves least of the flights.
+        the ``part`` of it is made which leaves least of the flights.
         """
         step = theta - self.point
         step[:self.known][self.curved] = 0.0
         acts = theta[:self.known][self.curved].any()
+        self.part = STEPS[0]
         if not acts and (np.abs(step) <= self.typical)[:self.known].all():
             return theta
         starts, points = self.flights[0].starts if acts else {}, []
@@ -242,8 +244,8 @@ class Linearised:
                 at[self.index[name]] = value
             left = sum(self._left(k, at + eta, found) for k, (eta, found) in enumerate(
                 zip(etas, spectra, strict=True)))
-            points.append((left, at, {name: dict(start) for name, start in starts.items()}))
-        _, theta, moved = min(points, key=lambda point: point[0])
+            points.append((left, part, at, {name: dict(start) for name, start in starts.items()}))
+        _, self.part, theta, moved = min(points, key=lambda point: point[0])
         starts.update(moved)
         self._last.clear()      # was made at the starts before
         return theta
@@ -276,9 +278,9 @@ class Linearised:
             if self._phi.get(flight, (None,))[0] is not own or own is None:
                 self._phi[flight] = own, self._spectrum(
                     flight, np.zeros(shape), -phi.reshape(*shape, -1), own)
-            # linear about the robot file
-            found = self._spectrum(
-                flight, linear.residual - linear.slopes @ at, linear.slopes, own)
+            moved = np.flatnonzero(at)      # few; the residual is linear about the robot file
+            residual = linear.residual - linear.slopes[..., moved] @ at[moved]
+            found = self._spectrum(flight, residual, linear.slopes, own)
             spectra.append(found.joined([(column, key, rows) for at_flight, column, key, rows in (
                 *((f, c, key, every) for f, key, c in self.repeats if fitted),
                 *((k, c, key, rows) for c, (key, rows) in self.late.items()))

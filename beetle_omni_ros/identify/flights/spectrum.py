@@ -35,13 +35,11 @@ class Linear:
     Attributes:
         residual: (N, C) measured minus expected at the point.
         slopes: (N, C, K) derivatives by the keys.
-        measured: (N, C) measurements.
 
     """
 
     residual: np.ndarray
     slopes: np.ndarray
-    measured: np.ndarray
 
 
 @dataclass(eq=False)
@@ -227,11 +225,12 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
     used = frequency <= min(EDGES[-1], highest.max())
     coefficients = np.zeros((len(rows), int(used.sum()), len(floor)))
     parts = []
+    acts = (slopes != 0).any(axis=0)    # most keys act on few channels
     for channels in groups:
-        keys = np.flatnonzero((slopes[:, channels] != 0).any(axis=(0, 1)))
+        keys = np.flatnonzero(acts[channels].any(axis=0))
         made = np.zeros((*coefficients.shape[:2], len(channels), len(keys)))
         for k, c in enumerate(channels):
-            own = np.flatnonzero((slopes[:, c, keys] != 0).any(axis=0))  # most act on few channels
+            own = np.flatnonzero(acts[c, keys])
             both = np.column_stack([residual[:, c], slopes[:, c, keys[own]]])
             if filters is not None:
                 both = _whitened(both, np.flatnonzero(mask[:, c]), filters[c])

@@ -96,11 +96,11 @@ class TableFlight:
         chosen = [k for k, why in enumerate(reasons) if not why]
         self.channels = tuple(CHANNELS[k] for k in chosen)
         self.reasons = dict(zip(CHANNELS, reasons, strict=True))
-        self._measured = measured[:, chosen]
+        self._readings = measured[:, chosen]
         self._chosen = chosen
         self._airborne = known & self._flying()
-        self.mask = np.isfinite(self._measured) & self._airborne[:, None]
-        self._measured = np.nan_to_num(self._measured)
+        self.mask = np.isfinite(self._readings) & self._airborne[:, None]
+        self._readings = np.nan_to_num(self._readings)
 
     @property
     def _motor(self):
@@ -253,7 +253,7 @@ class TableFlight:
         """Leave groups of channels out, for this ``reason``."""
         keep = [k for k, name in enumerate(self.channels) if not name.startswith(groups)]
         self.reasons |= {name: reason for name in self.channels if name.startswith(groups)}
-        self.mask, self._measured = self.mask[:, keep], self._measured[:, keep]
+        self.mask, self._readings = self.mask[:, keep], self._readings[:, keep]
         self._chosen = [self._chosen[k] for k in keep]
         self.channels = tuple(self.channels[k] for k in keep)
 
@@ -299,8 +299,11 @@ class TableFlight:
             ahead = {**theta, name: theta.get(name, 0.0) + step}
             behind = {**theta, name: theta.get(name, 0.0) - step}
             slopes[:, :, k] = -(self._full(ahead) - self._full(behind)) / (2 * step)
-        return Linear(self._measured - now[:, self._chosen], slopes[:, self._chosen],
-                      self._measured)
+        return Linear(self._readings - now[:, self._chosen], slopes[:, self._chosen])
+
+    def measured(self, theta: dict[str, float]) -> np.ndarray:
+        """(N, C) measurements of the channels, which depend on no deviation."""
+        return self._readings
 
     def balance(self, names: list[str]) -> tuple[np.ndarray, np.ndarray] | None:
         """
