@@ -108,9 +108,9 @@ class Format:
 
 
 def turned_to_world(signals: dict[str, Signal]) -> list[str]:
-    """Readings of the IMU that an estimator has turned by the attitude of the same row."""
-    return [name for name in ('specific_force', 'angular_velocity')
-            if name in signals and signals[name].frame == 'world']
+    """Readings of body axes that an estimator has turned by the attitude of the same row."""
+    return [name for name, own in signals.items()
+            if own.frame == 'world' and FRAMES[name][0] == 'body']
 
 
 def _signal(name, content, path):
