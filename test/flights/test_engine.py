@@ -252,10 +252,16 @@ def by_mocap(tmp_path):
         line for line in share_path('params/formats/nanobench.yaml').read_text().splitlines(True)
         if not line.startswith('specific_force')).replace('clock: radio', 'clock: mocap'))
 
-    def result(seeds, **effect):
+    def result(seeds, board=None, **effect):
         flights = [write_flight(tmp_path / f'{k}.csv', k, **effect) for k in seeds]
         for k, flight in enumerate(flights):
             rows = np.loadtxt(flight, delimiter=',', skiprows=1)[200:]
+            if board is not None:   # attitude and gyroscope have the axes of one turned board
+                body = Rotation.from_quat(rows[:, 4:8])
+                rows[:, 11:14] = body.apply(rows[:, 11:14])
+                rows[:, 4:8] = (body * Rotation.from_rotvec(board)).as_quat()
+                form.write_text(form.read_text().replace(
+                    'rad/s, frame: body', 'rad/s, frame: world'))
             rows[:, 1:8] += np.random.default_rng(k).normal(size=(len(rows), 7)) * 2e-4
             np.savetxt(flight, rows, delimiter=',', header=HEADER, comments='', fmt='%.7g')
         return gap_of(flights, str(form))
@@ -280,6 +286,15 @@ def test_a_wind_of_a_fifth_of_the_weight_is_not_taken_for_markers_that_are_turne
     assert named(result) == {'wind'}
     force = result['effects'][0]['parameters']['force']['value']
     assert np.allclose(force, [0.05, -0.03, 0.0], atol=0.004)
+
+
+def test_rates_turned_by_an_attitude_do_not_deny_that_it_is_turned(by_mocap):
+    board = np.array([0.04, -0.05, 0.0])
+    result = by_mocap(range(2), board=board)
+    effect, = result['effects']     # a wind may be beside it: these flights move gently
+    assert effect['names'][0] == 'mocap_misalignment' and not result['groups']['rate']['used']
+    low, high = np.transpose(effect['parameters']['rotation']['interval'])
+    assert (low < board).all() and (board < high).all() and (high - low)[:2].max() < 0.02
 
 
 def test_a_drag_that_too_few_blocks_show_is_no_unknown_force(tmp_path):

@@ -38,7 +38,7 @@ def test_units_signs_orders_and_directions_are_those_that_the_format_declares(tm
     assert np.allclose(table.values['duty'][0], [1, 0, 0, 0])
 
 
-def test_a_specific_force_in_world_is_turned_by_the_attitude_of_its_row(tmp_path):
+def test_readings_in_world_are_turned_by_the_attitude_of_its_row(tmp_path):
     path, world = tmp_path / 'flight.csv', FORMAT.replace('unit: g,', 'unit: g, frame: world,')
     path.write_text(HEADER + rows(range(0, 200, 10)) + '200,0,0.5,1,,0.6,0,0,0,0,0,0\n')
     forces = read_flight(path, declared(tmp_path, world)).values['specific_force']
@@ -46,8 +46,13 @@ def test_a_specific_force_in_world_is_turned_by_the_attitude_of_its_row(tmp_path
     cosine, sine = 0.28, 0.96
     expected = [0, -0.5 * cosine - sine, cosine - 0.5 * sine]
     assert np.allclose(forces[:20] / 9.80665, expected) and np.isnan(forces[20]).all()
-    with pytest.raises(ParameterError, match="'quaternion' is missing: expected the attitude"):
-        declared(tmp_path, ''.join(line for line in world.splitlines(True) if 'wxyz' not in line))
+    rates = FORMAT.replace('specific_force', 'angular_velocity').replace('unit: g', 'unit: rad/s')
+    turned = read_flight(path, declared(tmp_path, rates.replace('rad/s,', 'rad/s, frame: world,')))
+    assert np.allclose(turned.values['angular_velocity'][:20], expected)
+    for text in (world, rates.replace('rad/s,', 'rad/s, frame: world,')):
+        with pytest.raises(ParameterError, match="'quaternion' is missing: expected the attitude"):
+            declared(tmp_path, ''.join(line for line in text.splitlines(True)
+                                       if 'wxyz' not in line))
     with pytest.raises(ParameterError, match="expected one of body, world, found 'sky'"):
         declared(tmp_path, FORMAT.replace('unit: g,', 'unit: g, frame: sky,'))
 

@@ -31,7 +31,7 @@ from beetle_omni_ros.identify.recording.series import (
     turning,
     wander,
 )
-from beetle_omni_ros.identify.recording.table import Table
+from beetle_omni_ros.identify.recording.table import Table, turned_to_world
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
 
@@ -191,6 +191,8 @@ class TableFlight:
         v, inputs, n = self.table.values, self.motion, len(self.time)
         reasons = [next((f'no {NEEDED[s]}' for s in need if s not in v), '') for need in (
             ('position', 'quaternion', 'specific_force'), ('quaternion', 'angular_velocity'))]
+        if 'angular_velocity' in turned_to_world(self.table.format.signals):
+            reasons[1] = reasons[1] or 'turned by the attitude, so that they do not show its axes'
         limit = _highest(self._wander)
         self.apart = '' if limit >= SLOWEST or all(reasons) else (
             f'the clocks of MoCap and IMU wander by {1e3 * self._wander:.0f} ms' if np.isfinite(

@@ -42,7 +42,7 @@ SIGNALS: dict[str, tuple[int, dict[str, float]]] = {
 # Signal -> frames that it may have, the first one by default.
 FRAMES = {'position': ('world',), 'velocity': ('world', 'body'), 'acceleration': ('world',),
           'quaternion': ('body_to_world', 'world_to_body'), 'specific_force': ('body', 'world'),
-          'angular_velocity': ('body',), 'target_position': ('world',)}
+          'angular_velocity': ('body', 'world'), 'target_position': ('world',)}
 ORDERS = {'xyzw': (0, 1, 2, 3), 'wxyz': (1, 2, 3, 0)}
 
 
@@ -100,15 +100,17 @@ class Format:
             raise ParameterError(f"{path}: key 'time' is missing: expected the column of the time")
         if 'thrust' in signals and 'duty' in signals:
             raise ParameterError(f"{path}: expected 'thrust' or 'duty', found both")
-        if 'quaternion' not in signals and turned_to_world(signals):
-            raise ParameterError(f"{path}: key 'quaternion' is missing: expected the attitude "
-                                 "that turns 'specific_force' from world to body")
+        if 'quaternion' not in signals:
+            for key in turned_to_world(signals):
+                raise ParameterError(f"{path}: key 'quaternion' is missing: expected the attitude "
+                                     f'that turns {key!r} from world to body')
         return cls(name, signals, deviation)
 
 
-def turned_to_world(signals: dict[str, Signal]) -> bool:
-    """Whether an estimator has turned the accelerometer by the attitude of the same row."""
-    return 'specific_force' in signals and signals['specific_force'].frame == 'world'
+def turned_to_world(signals: dict[str, Signal]) -> list[str]:
+    """Readings of body axes that an estimator has turned by the attitude of the same row."""
+    return [name for name, own in signals.items()
+            if own.frame == 'world' and FRAMES[name][0] == 'body']
 
 
 def _signal(name, content, path):
@@ -176,8 +178,8 @@ def read_flight(path: Path, form: Format) -> Table:
         block = block * signal.sign * SIGNALS[name][1][signal.unit] / signal.full
         block = block[:, ORDERS[signal.order]] if name == 'quaternion' else block
         values[name] = block * [-1, -1, -1, 1] if signal.frame == 'world_to_body' else block
-    if turned_to_world(form.signals):
-        values['specific_force'] = _in_body(values['specific_force'], values['quaternion'])
+    for name in turned_to_world(form.signals):
+        values[name] = _in_body(values[name], values['quaternion'])
     t = values.pop('time')[:, 0]
     if len(t) < 10 or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
         raise LogError(f'{path}: column {form.signals["time"].columns[0]!r}: expected at least 10 '
