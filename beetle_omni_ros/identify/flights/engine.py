@@ -236,8 +236,7 @@ class Engine(Linearised):
         narrow, bounds = self.narrow[:self.known].copy(), self.bounds.copy()
         for k in named:
             narrow[k] = wide[k]
-            if self.kept[k]:    # beyond its tolerance
-                bounds[k, 1] = np.inf
+        bounds[[k for k in named if self.kept[k]], 1] = np.inf      # beyond their tolerances
         flat = np.zeros(more, dtype=bool)
         return Judge(equations, np.concatenate([narrow, form]),
                      np.concatenate([self.typical[:self.known], size]),
