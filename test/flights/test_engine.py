@@ -3,6 +3,7 @@
 from dataclasses import replace
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from scipy.stats import norm
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.identify.flights.command import gap_results
+from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import Judge, normal
+from beetle_omni_ros.identify.flights.keys import Entry
 from beetle_omni_ros.identify.flights.spectrum import EDGES, spectrum
 from beetle_omni_ros.identify.flights.verdict import load_tables
 from beetle_omni_ros.identify.recording.series import turning, wander
@@ -97,6 +100,19 @@ def test_a_tolerance_with_limits_agrees_with_quadrature():
                 points=[0, estimate], limit=200)[0] / norm.sf(low, 0, wide)
     assert judge.gain((0,), ()) == pytest.approx(np.log(free / inside), abs=1e-3)
     assert judge.posterior(()).theta[0] < high + 3 * sigma
+
+
+def test_a_delay_far_beyond_its_tolerance_has_one_value_in_all_bands():
+    engine, true = object.__new__(Engine), np.array([0.017])
+    vars(engine).update(
+        names=['delay'], entries=[Entry('delay', ('delay',))], index={'delay': 0}, known=1,
+        narrow=np.array([0.0025]), typical=np.array([0.01]), flight=np.zeros(1), late={},
+        bounds=np.array([[0.0, 0.004]]), kept=np.array([True]), owner=np.zeros(1, dtype=int),
+        far=np.array([False]), acting=np.array([False]), alpha=0.05)
+    found = SimpleNamespace(best=(0,), theta=true, unsteady={}, spectra=[
+        linear_flight(np.random.default_rng(4), true, keys=1)])
+    engine._constancy(found, {})
+    assert found.unsteady[0] < 0        # one value in each group of bands explains no more
 
 
 def test_bounds_of_keys_that_are_nearly_the_same_leave_a_finite_evidence():

@@ -6,13 +6,14 @@ The equations of all effects are compared with those of the plant in test/sim/te
 
 from dataclasses import replace
 
-from flights import KEYS, model, Motion, ROBOT, solved
+from flights import KEYS, model, Motion, PLACE, ROBOT, solved
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.identify.flights.body import BodyModel
-from beetle_omni_ros.identify.flights.keys import all_keys, extra_keys
+from beetle_omni_ros.identify.flights.body import BodyModel, tilting_modules
+from beetle_omni_ros.identify.flights.keys import all_keys, entries_of, extra_keys
+from beetle_omni_ros.model.parameters import RobotParameters
 
 MOTION = Motion()
 HOVER = ROBOT.mass * ROBOT.gravity / 4
@@ -149,3 +150,16 @@ def test_a_wind_velocity_moves_the_drag_and_has_no_key_without_one():
     more = on_rotors(0.1 * speeds()[:, :, None] * split(air)[1])     # than the drag in still air
     found = solved(made, names, 'B', without(made, *more))
     assert np.allclose([found[name] for name in names], true, rtol=0.01, atol=0.01)
+
+
+@pytest.mark.parametrize('file', [ROBOT, RobotParameters.load()], ids=['rigid', 'modules'])
+def test_what_forces_and_torques_alone_show_is_tested_for_the_answer_of_feedback(file):
+    keys = {**all_keys(file), **extra_keys(file)}
+    made = model(MOTION.flight(), file, BodyModel(file, keys, tilting_modules(file)), keys)
+    shown, tested = list(all_keys(file)), {}
+    largest = np.abs(made.linear({}, shown).slopes).max(axis=0)
+    for entry in entries_of(all_keys(file)):
+        by = largest[:, [shown.index(name) for name in entry.keys]]
+        if by[PLACE['B']].any() and not by[PLACE['J']].any():
+            tested[entry.label] = entry.in_loop
+    assert len(tested) > 20 and all(tested.values()), tested

@@ -235,13 +235,14 @@ class Engine(Linearised):
     def _judge(self, equations, wide=None, named=(), form=(), size=()):
         """Judge of all known keys, and of deviations of bands with priors ``form``, ``size``."""
         more = len(form)
-        narrow = self.narrow[:self.known].copy()
+        narrow, bounds = self.narrow[:self.known].copy(), self.bounds.copy()
         for k in named:
             narrow[k] = wide[k]
+        bounds[[k for k in named if self.kept[k]], 1] = np.inf      # beyond their tolerances
         flat = np.zeros(more, dtype=bool)
         return Judge(equations, np.concatenate([narrow, form]),
                      np.concatenate([self.typical[:self.known], size]),
-                     np.concatenate([self.bounds, np.tile([-np.inf, np.inf], (more, 1))]),
+                     np.concatenate([bounds, np.tile([-np.inf, np.inf], (more, 1))]),
                      np.concatenate([self.kept, flat]),
                      np.concatenate([self.owner, np.full(more, len(self.entries))]),
                      None if self.certain else self.alpha / len(self.entries),

@@ -288,8 +288,7 @@ def entries_of(keys: dict[str, Key]) -> list[Entry]:
         effect = CATALOGUE[name]
         own = tuple(key for key, at in keys.items() if at.effect == name and not at.form)
         # noise of IMU and MoCap reaches the commands; servos are simulated from commands
-        channels = TREATMENTS[name].channels
-        body = channels[:1] in 'BAW' and 'J' not in channels
+        body = any(keys[key].body or 'J' not in keys[key].groups for key in own)
         result += [Entry(name, (key,), k + 1, body) for k, key in enumerate(own)] \
             if effect.each else [Entry(name, own, None, body)]
     return result
