@@ -19,8 +19,9 @@ from beetle_omni_ros.identify.flights.evidence import Judge, normal
 from beetle_omni_ros.identify.flights.keys import Entry
 from beetle_omni_ros.identify.flights.spectrum import EDGES, spectrum
 from beetle_omni_ros.identify.flights.verdict import load_tables
+from beetle_omni_ros.identify.recording.conventions import read_tables
 from beetle_omni_ros.identify.recording.series import turning, wander
-from beetle_omni_ros.identify.recording.table import Format, read_flight
+from beetle_omni_ros.identify.recording.table import Format
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import ParameterError
@@ -414,7 +415,7 @@ def test_mocap_shows_a_bias_of_the_accelerometer_whatever_the_thrust_is(tmp_path
 def test_a_late_clock_of_mocap_is_measured_and_taken_out(tmp_path, late):
     path = write_flight(tmp_path / 'a.csv', 50, seconds=20, late=late)
     model, form = RobotParameters.load(ROBOT), Format.load('nanobench')
-    table = read_flight(path, form)
+    table, = read_tables([path], form)
     seen, felt = turning(table.values['quaternion'], 0.01), table.values['angular_velocity']
     found, deviation = wander(seen, felt, np.ones(len(table), dtype=bool), 0.01)
     assert found == pytest.approx(late, abs=0.004) and deviation < 0.015

@@ -45,8 +45,9 @@ from beetle_omni_ros.identify.flights.table_flight import (
 )
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.recording.bag import Recording
+from beetle_omni_ros.identify.recording.conventions import read_tables
 from beetle_omni_ros.identify.recording.parameters import GapParameters
-from beetle_omni_ros.identify.recording.table import Format, read_flight
+from beetle_omni_ros.identify.recording.table import Format
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError
@@ -240,7 +241,7 @@ def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
         raise ParameterError(f"--format {declared.name}: expected the key 'duty' or 'thrust'")
     keys = keys_of(robot, {*FORCES, *TORQUES, *SENSORS})
     body = BodyModel(robot, {**all_keys(robot), **extra_keys(robot)}, tilting_modules(robot))
-    return [TableFlight(read_flight(path, declared), robot, body, keys) for path in paths]
+    return [TableFlight(table, robot, body, keys) for table in read_tables(paths, declared)]
 
 
 def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight],

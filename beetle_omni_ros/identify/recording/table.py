@@ -159,18 +159,22 @@ class Table:
         return len(next(iter(self.values.values())))
 
 
-def read_flight(path: Path, form: Format) -> Table:
+def columns_of(path: Path, form: Format) -> dict[str, np.ndarray]:
+    """Columns of a file that the format names; LogError with file, row and column."""
+    return read_table(path, partial(_wanted, form), 'the columns of the format', gaps=True)[0]
+
+
+def table_of(path: Path, columns: dict[str, np.ndarray], form: Format) -> Table:
     """
-    Read a CSV file, plain or compressed by gzip.
+    Flight of the columns of a file.
 
     Each row goes to the nearest point of a regular grid with the median period. An empty cell and
     a point without row are samples that do not exist.
 
     Raises:
-        LogError: with file, row and column.
+        LogError: no increasing times.
 
     """
-    columns, _ = read_table(path, partial(_wanted, form), 'the columns of the format', gaps=True)
     count, values = len(next(iter(columns.values()))), {}
     for name, signal in form.signals.items():
         block = np.stack([columns[column] if column else np.full(count, np.nan)
