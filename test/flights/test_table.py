@@ -77,11 +77,13 @@ def test_a_single_column_needs_no_list_and_the_unit_1_no_quotes(tmp_path):
 
 def test_empty_cells_and_lost_rows_are_samples_that_do_not_exist(tmp_path):
     path = tmp_path / 'flight.csv'
-    lines = rows(range(0, 100, 10)) + '100,,0,1,1,0,0,0,,0,0,0\n' + rows(range(130, 200, 10))
+    lines = rows(range(0, 90, 10)) + '90,0,0,1,0,0,0,0,0,0,0,0\n' \
+        + '100,,0,1,1,0,0,0,,0,0,0\n' + rows(range(130, 200, 10))
     path.write_text(HEADER + lines)
     table, = read_tables([path], declared(tmp_path))
     assert len(table) == 20
     assert np.isnan(table.values['specific_force'][10]).tolist() == [True, False, False]
+    assert np.isnan(table.values['quaternion'][9]).all()    # a pose that MoCap has lost
     assert np.isnan(table.values['duty'][11:13]).all()
     assert not np.isnan(table.values['duty'][13]).any()
 

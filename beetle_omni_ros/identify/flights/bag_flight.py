@@ -22,7 +22,7 @@ from beetle_omni_ros.identify.flights.signals import IMU_LAG, Signals
 from beetle_omni_ros.identify.flights.spectrum import blocks_of, Linear, warm
 from beetle_omni_ros.identify.recording.bag import COMMAND, Recording
 from beetle_omni_ros.identify.recording.parameters import GapParameters
-from beetle_omni_ros.identify.recording.series import low_pass, matrices, THIN, within
+from beetle_omni_ros.identify.recording.series import FASTEST, low_pass, matrices, THIN, within
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.parts import ThrustMap
 
@@ -42,10 +42,9 @@ LATE_TILTS = {TILT_BUS, IMU_LAG, 'command_latency.delay', 'joint_command_latency
 BOTH_SIDES = 'delay'
 LEAST = 0.1             # smallest share of a start to which its keys may fall in one step
 WIDEST = 16.0           # [Hz] low-pass edge of joint angles, of which every second one counts
-POSES = 8.0             # [Hz] the same of MoCap, whose noise grows with the square of frequency
 # [Hz] largest frequency of each group: above 8 Hz the filters of readings and tilts differ, and a
 # fit takes the difference for a larger mass of the tilting modules
-FASTEST = {'B': 8.0, 'A': POSES, 'W': POSES, 'J': WIDEST}
+HIGHEST = {'B': 8.0, 'A': FASTEST, 'W': FASTEST, 'J': WIDEST}
 
 
 class BagFlight:
@@ -66,7 +65,7 @@ class BagFlight:
 
     channels = tuple(name for group in CHANNELS.values() for name in group)
     turning = 'rate'        # IMU and MoCap agree in it where the robot moves
-    highest = np.repeat([FASTEST[group] for group in CHANNELS], [6, 3, 3, 4])
+    highest = np.repeat([HIGHEST[group] for group in CHANNELS], [6, 3, 3, 4])
 
     def __init__(self, flight: Recording, robot: RobotParameters, body: BodyModel,
                  keys: dict[str, Key], p: GapParameters):
@@ -87,7 +86,7 @@ class BagFlight:
         self.rows = first + THIN * np.arange(count // THIN)
         self.time = self.signals.t[self.rows]
         self._fine = low_pass(WIDEST, 1, p.grid)
-        self._poses = low_pass(POSES, 1, p.grid)
+        self._poses = low_pass(FASTEST, 1, p.grid)
         self.mask = np.ones((len(self.rows), len(self.channels)), dtype=bool)
         self.mask[:, :6] = self.trusted[self.rows, None]
         far = self._poses.margin
@@ -186,9 +185,9 @@ class BagFlight:
                 behind, ahead = (
                     now if end == theta and self.signals.model_tilts is None
                     else self._guided(end, groups) for end in ends[name])
-                part = own.get(name, 1.0)
                 for group in groups:
-                    slopes[:, PLACE[group], k] = (ahead[group] - behind[group]) / part
+                    slopes[:, PLACE[group], k] = (ahead[group] - behind[group]) \
+                        / own.get(name, 1.0)
             elif name in factors:
                 key, part = factors[name]
                 slopes[:, :, k] = part * of_keys[:, :, keys.index(key)]
@@ -210,7 +209,8 @@ class BagFlight:
 
     def measured(self, theta: dict[str, float]) -> np.ndarray:
         """(M, 16) measurements of the channels at deviations ``theta``."""
-        force, rate, turning = self.signals.imu(theta := self._real(theta)[0])
+        theta = self._real(theta)[0]
+        force, rate, turning = self.signals.imu(theta)
         world = np.einsum('nij,nj->ni', matrices(self.signals.pose(theta)[1]), force)
         world[:, 2] -= self.robot.gravity
         body = np.concatenate([force, turning], axis=1)

@@ -216,7 +216,7 @@ class Linearised:
         for each, still in zip(spectra, self.still, strict=True):
             each.hidden = still
         self.narrow[self.known:] = self.start[self.known:]
-        for each, last in zip(spectra, before, strict=False):
+        for each, last in zip(spectra, before, strict=True):
             each.noise = last.noise
         self._learn(spectra, 2)
         return spectra

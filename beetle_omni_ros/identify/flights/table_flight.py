@@ -25,6 +25,7 @@ from beetle_omni_ros.identify.recording.series import (
     along,
     derivative,
     derivatives,
+    FASTEST,
     filled,
     rising,
     slow,
@@ -46,8 +47,6 @@ FULL = 0.995            # share of full duty from which a command is saturated
 PHASE = 0.1             # [rad] error by wrong stamps up to which a frequency counts
 HELD = 2.0              # [s] blocks of the balance of torques, so below 0.25 Hz
 SLOWEST = 0.25          # [Hz] clocks that do not agree up to here are not compared
-FASTEST = 8.0           # [Hz] of forces by MoCap, whose noise grows with the square of frequency,
-                        # and of robots that tilt, as in bags
 TILTS = 20.0            # [Hz] edge of the filter of tilts: servos are slower
 # Signal -> what the comparison of MoCap and IMU lacks without it.
 NEEDED = {'position': 'position', 'quaternion': 'quaternion', 'specific_force': 'accelerometer',
@@ -161,7 +160,7 @@ class TableFlight:
             reasons[3:] = ['no gyroscope'] * 3
         tilt = derivatives(filled(v['tilt'], h)[0], TILTS, h) if 'tilt' in v \
             else np.zeros((3, n, 4))
-        if 'tilt' in v:
+        if 'tilt' in v:     # above it filters of readings and tilts differ, as in bags
             self.highest = min(self.highest, FASTEST)
         inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': rate, 'tilt': tilt[0],
                   'thrust': self._thrust({})[0], 'tilt_rate': tilt[1],

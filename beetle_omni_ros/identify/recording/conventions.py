@@ -9,11 +9,11 @@ from scipy.stats import wilcoxon
 
 from beetle_omni_ros.identify.recording.series import (
     aligned,
+    FASTEST,
     filled,
-    REACH,
+    shifted,
     slow,
     turning,
-    WINDOW,
 )
 from beetle_omni_ros.identify.recording.table import (
     columns_of,
@@ -28,7 +28,6 @@ from beetle_omni_ros.model.schema import ParameterError
 
 LEVEL = 1e-3        # probability at which another declaration fits better by chance
 QUIET = 0.005       # [rad/s] errors of a small gyroscope, below which no difference counts
-HIGHEST = 8.0       # [Hz] above it, MoCap shows noise
 READINGS = 'quaternion', 'angular_velocity'
 
 
@@ -50,7 +49,8 @@ def read_tables(paths: Sequence[Path], form: Format) -> list[Table]:
         tried = np.concatenate([differences(table_of(path, own, changed))
                                 for path, own in zip(paths, columns, strict=True)])
         gain = _disagreement(declared) - _disagreement(tried)
-        if len(gain) and wilcoxon(gain, alternative='greater').pvalue < LEVEL:
+        if len(gain) and wilcoxon(
+                gain, zero_method='zsplit', alternative='greater').pvalue < LEVEL:
             before, after = (1e3 * np.sqrt(np.median(x[:, 0])) for x in (declared, tried))
             found.append((float(np.median(gain)), (
                 f"key '{key}.{what}': expected {other!r}, found {now!r}: the gyroscope differs by "
@@ -89,24 +89,20 @@ def differences(table: Table) -> np.ndarray:
     of the clocks of each window and a mounting and a bias of the flight are taken out, as these
     are no matter of the format.
     """
-    h, pairs = table.period, []
+    h = table.period
     (attitude, there), (felt, known) = (filled(x, h) for x in (
         aligned(table.values['quaternion']), table.values['angular_velocity']))
     if not (there & known).any():
         return np.zeros((0, 2))
-    seen, felt = slow(turning(attitude, h), h, HIGHEST), slow(felt, h, HIGHEST)
-    reach, length = int(REACH / h), int(WINDOW / h)
-    steps = np.arange(-reach, reach + 1)
-    for first in range(reach, len(table) - length - reach, length):
-        rows = first + np.flatnonzero((there & known)[first:first + length])
-        if len(rows) > length / 2:
-            best = steps[np.argmin([((seen[rows + k] - felt[rows])**2).sum() for k in steps])]
-            pairs.append((seen[rows + best], felt[rows]))
+    seen, felt = slow(turning(attitude, h), h, FASTEST), slow(felt, h, FASTEST)
+    pairs = [(seen[rows + steps[cost.argmin()]], felt[rows])
+             for rows, steps, cost in shifted(seen, felt, there & known, h)]
     if not pairs:
         return np.zeros((0, 2))
     x, y = (np.concatenate(part) for part in zip(*pairs, strict=True))
     axes = np.eye(3)
-    slopes = np.concatenate([np.cross(x[:, None], axes), np.broadcast_to(axes, (len(x), 3, 3))], 1)
-    turn = np.linalg.lstsq(slopes.transpose(0, 2, 1).reshape(-1, 6), (y - x).ravel())[0]
+    slopes = np.stack([*(np.cross(x, axis) for axis in axes),
+                       *(np.broadcast_to(axis, x.shape) for axis in axes)], axis=2)
+    turn = np.linalg.lstsq(slopes.reshape(-1, 6), (y - x).ravel(), rcond=None)[0]
     made = [(a + np.cross(a, turn[:3]), b - turn[3:]) for a, b in pairs]
     return np.array([[3 * ((b - a)**2).mean(), 3 * (a**2 + b**2).mean()] for a, b in made])

@@ -17,6 +17,7 @@ SMOOTH = 0.05       # [s] moving average of positions before their derivative
 EDGE = 1.0          # [s] at both ends, for smoothing and history
 WINDOW = 2.0        # [s] in which one shift of two clocks is measured
 REACH = 0.15        # [s] largest shift
+FASTEST = 8.0       # [Hz] of MoCap, whose noise grows with the square of frequency
 LEAST = 3           # windows of which the scatter can be known
 STENCILS = (1.0,), (0.5, 0.0, -0.5), (1.0, -2.0, 1.0)     # of derivatives
 
@@ -192,6 +193,20 @@ def along(thrust, yaw):
     return Rotation.from_matrix(matrix).as_quat()
 
 
+def shifted(seen, felt, known, period):
+    """
+    Yield rows (R,) of each window, shifts in samples (S,), and squared differences by these (S,).
+
+    Arguments are those of :func:`wander`; half of the samples of a window must count.
+    """
+    reach, length = int(REACH / period), int(WINDOW / period)
+    steps = np.arange(-reach, reach + 1)
+    for first in range(reach, len(seen) - length - reach, length):
+        rows = first + np.flatnonzero(known[first:first + length])
+        if len(rows) > length / 2:
+            yield rows, steps, np.array([((seen[rows + k] - felt[rows])**2).sum() for k in steps])
+
+
 def wander(seen, felt, known, period):
     """
     Shift of the clock of one series against that of another, by windows.
@@ -207,13 +222,10 @@ def wander(seen, felt, known, period):
         [s]; NaN and infinity if too few windows show it.
 
     """
-    reach, length = int(REACH / period), int(WINDOW / period)
-    steps, found = np.arange(-reach, reach + 1), []
-    for first in range(reach, len(seen) - length - reach, length):
-        rows = first + np.flatnonzero(known[first:first + length])
-        cost = np.array([((seen[rows + k] - felt[rows])**2).sum() for k in steps])
+    found = []
+    for _, steps, cost in shifted(seen, felt, known, period):
         best = int(cost.argmin())
-        if len(rows) > length / 2 and 0 < best < len(steps) - 1:
+        if 0 < best < len(steps) - 1:
             before, here, after = cost[best - 1:best + 2]
             found.append((steps[best] + 0.5 * (before - after) / (before - 2 * here + after))
                          * period)

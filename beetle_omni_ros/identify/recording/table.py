@@ -180,7 +180,9 @@ def table_of(path: Path, columns: dict[str, np.ndarray], form: Format) -> Table:
         block = np.stack([columns[column] if column else np.full(count, np.nan)
                           for column in signal.columns], axis=1)
         block = block * signal.sign * SIGNALS[name][1][signal.unit] / signal.full
-        block = block[:, ORDERS[signal.order]] if name == 'quaternion' else block
+        if name == 'quaternion':
+            block = block[:, ORDERS[signal.order]]
+            block[~block.any(axis=1)] = np.nan      # a lost attitude
         values[name] = block * [-1, -1, -1, 1] if signal.frame == 'world_to_body' else block
     for name in turned_to_world(form.signals):
         values[name] = _in_body(values[name], values['quaternion'])
@@ -198,7 +200,7 @@ def table_of(path: Path, columns: dict[str, np.ndarray], form: Format) -> Table:
 
 
 def _in_body(vectors, quaternion):
-    there = np.isfinite(quaternion).all(axis=1) & quaternion.any(axis=1)
+    there = np.isfinite(quaternion).all(axis=1)
     body = np.full(vectors.shape, np.nan)
     body[there] = Rotation.from_quat(quaternion[there]).inv().apply(vectors[there])
     return body
