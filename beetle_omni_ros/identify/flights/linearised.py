@@ -25,6 +25,8 @@ FORM = 0.25             # relative error of an entry by its form
 # Share of the variance that motion must explain: noise that feedback answers in phase then biases
 # a factor by less than the error of form.
 MOVED = 1 / (1 + FORM**2)
+DRIVES = 'thrust_coefficient.scale'     # key whose slopes are what the commands cause
+MOVES = 'inertia.inertia'       # keys whose slopes are the acceleration itself
 IN_LOOP = 'force', 'torque', 'acceleration', 'rate', 'joint'  # noise of these reaches commands
 DYNAMIC = range(1, len(EDGES))   # bands without the mean
 SAME = 0.04             # share of a typical difference between flights by which one value varies
@@ -70,7 +72,9 @@ class Linearised:
         self.index = {name: k for k, name in enumerate(names)}
         self._generic()
         self.filters: list = [None] * len(self.flights)     # (C, L) of each flight
-        self.still: list = [[] for _ in self.flights]   # bands and channels without motion
+        # bands and channels without motion, and those in which commands balance other forces
+        self.still: list = [[] for _ in self.flights]
+        self.balanced: list = [[] for _ in self.flights]
         self._last: dict = {}       # flight -> point and linear model
         self._phi: dict = {}        # flight -> its filters, and spectrum of the discrepancy
         kinds = [c.split('_')[0] for c in self.channels]
@@ -153,7 +157,7 @@ class Linearised:
         self.filters = [self._filter(s, s.noise) for s in spectra]
         self.common = self._filter(max(spectra, key=lambda s: s.band[-1]), pooled(spectra))
         spectra = self._spectra(theta, etas)
-        self.still = self._without_motion(spectra, theta, etas)
+        self._find_motion(spectra, theta, etas)
         return spectra
 
     @property
@@ -169,24 +173,30 @@ class Linearised:
                  for kind in IN_LOOP}
         return [(kind, own) for kind, own in found.items() if own]
 
-    def _without_motion(self, spectra, theta, etas):
+    def _find_motion(self, spectra, theta, etas):
         """
-        Bands and channels of each flight in which noise hides the motion, but for the mean.
+        Find bands and channels of each flight in which noise hides the motion, but for the mean.
 
         A controller at rest answers noise. Then motion and commands correlate with the noise of
         the sensors, and a fit takes the answer for the robot. Where IMU and MoCap show that the
         robot turns, what the model leaves is no noise, and counts. Joints may rest there, and
-        the noise of their readings, which is known, hides them.
+        the noise of their readings, which is known, hides them. Where the commands are large and
+        the acceleration is not, they balance known forces. These count, and only the inertia is
+        not known there.
         """
         fit, equations = self._learn(spectra)
-        found = []
+        self.still, self.balanced = [], []
         for k, (flight, each) in enumerate(zip(self.flights, spectra, strict=True)):
             values = dict(zip(self.names, self._at(k, theta + etas[k]), strict=False))
             whole = self.transformed(k, flight.measured(values)).residual
             rest = each.at(fit + equations.of_flight(k, fit))
             bands = {kind: self._hidden(each, own, rest, whole) for kind, own in self._in_loop()}
+            driven = {}
             if not flight.turning:      # what the model lacks is more than the noise
                 bands = {kind: bands.get(kind, []) for kind in flight.fed_back}
+                caused = each.by(self.names.index(DRIVES)) if DRIVES in self.names else whole
+                driven = {kind: set(bands[kind]) - {*self._hidden(each, own, rest, caused)}
+                          for kind, own in self._in_loop() if kind in bands}
             elif len(bands[flight.turning]) < len(DYNAMIC):
                 bands |= dict.fromkeys(('force', 'torque', 'joint'), [])
             if flight.turning:      # its answer biases gains by less than servos differ
@@ -194,9 +204,10 @@ class Linearised:
                 bands['joint'] = sorted({*bands['joint'], *self._hidden(
                     each, dict(self._in_loop())['joint'], noise, whole,
                     flight.p.tolerance_lag**2)})
-            found.append([(band, own) for kind, own in self._in_loop()
-                          for band in bands.get(kind, [])])
-        return found
+            for found, chosen in ((self.still, lambda kind: {*bands.get(kind, [])} - {
+                    *driven.get(kind, [])}), (self.balanced, lambda kind: driven.get(kind, []))):
+                found.append([(band, own) for kind, own in self._in_loop()
+                              for band in sorted(chosen(kind))])
 
     def _hidden(self, spectrum, own, rest, whole, most=1 - MOVED):
         """Bands in which ``rest`` is more than this share of the channels ``own`` of ``whole``."""
@@ -213,8 +224,10 @@ class Linearised:
         self._settle(theta, etas)
         self.acting, self.point = self.curved & (theta[:self.known] == 1), theta
         spectra = self._spectra(theta, etas)
-        for each, still in zip(spectra, self.still, strict=True):
+        moves = [k for k, name in enumerate(self.names) if name.startswith(MOVES)]
+        for each, still, balanced in zip(spectra, self.still, self.balanced, strict=True):
             each.hidden = still
+            each.forget(moves, balanced)
         self.narrow[self.known:] = self.start[self.known:]
         for each, last in zip(spectra, before, strict=True):
             each.noise = last.noise

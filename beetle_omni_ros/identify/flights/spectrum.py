@@ -80,6 +80,21 @@ class Spectrum:
             result[..., channels] += slopes @ x[keys]
         return result
 
+    def by(self, key: int) -> np.ndarray:
+        """(B, F, C) coefficients of the slopes by one key."""
+        result = np.zeros(self.residual.shape)
+        for channels, keys, slopes in self.parts:
+            result[..., channels] = slopes[..., keys == key].sum(axis=3)
+        return result
+
+    def forget(self, keys: list[int], bands: list[tuple[int, list[int]]]) -> None:
+        """Let these keys have no slope in some bands and channels."""
+        for channels, own, slopes in self.parts:
+            for band, lost in bands:
+                at = self.band[:slopes.shape[1]] == band
+                slopes[np.ix_(range(len(slopes)), at, np.isin(channels, lost),
+                              np.isin(own, keys))] = 0.0
+
     def joined(self, copies: list[tuple[int, int, list[int]]], other: Spectrum, count: int
                ) -> Spectrum:
         """

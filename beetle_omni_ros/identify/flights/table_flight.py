@@ -155,8 +155,10 @@ class TableFlight:
         if 'angular_velocity' in v:
             rate, _ = filled(v['angular_velocity'], h)
             turned = derivative(v['angular_velocity'], h)
+            self._turned = np.nan_to_num(derivative(rate, h))
         else:
             rate, turned = np.zeros((n, 3)), np.full((n, 3), np.nan)
+            self._turned = rate
             reasons[3:] = ['no gyroscope'] * 3
         tilt = derivatives(filled(v['tilt'], h)[0], TILTS, h) if 'tilt' in v \
             else np.zeros((3, n, 4))
@@ -268,10 +270,14 @@ class TableFlight:
 
     def _sensed(self, out, theta):
         """What the IMU reads by the body equations and by MoCap: misalignment, then bias."""
-        imu, mocap, force, rate = (
+        imu, mocap, force, rate, lever = (
             np.array([self.keys[name].base + theta.get(name, 0.0) for name in names_of(*key)])
             for key in (('imu_misalignment', 'rotation'), ('mocap_misalignment', 'rotation'),
-                        ('imu_accelerometer_bias', 'bias'), ('imu_gyroscope_bias', 'bias')))
+                        ('imu_accelerometer_bias', 'bias'), ('imu_gyroscope_bias', 'bias'),
+                        ('imu_lever_arm', 'offset')))
+        if lever.any():
+            rates = self.motion['rate']
+            force = force + np.cross(self._turned, lever) + np.cross(rates, np.cross(rates, lever))
         matrix = Rotation.from_rotvec(imu).as_matrix()
         # what MoCap states of its axes is turned back into the body
         seen = Rotation.from_rotvec(mocap).as_matrix().T @ matrix
@@ -373,7 +379,8 @@ def poses(table, far):
         late, deviation = np.nan, np.inf
         if 'angular_velocity' in v:
             felt, known = filled(v['angular_velocity'], h)
-            late, deviation = wander(turning(quaternion, h), felt, seen & known, h)
+            late, deviation = wander(slow(turning(quaternion, h), h, FASTEST),
+                                     slow(felt, h, FASTEST), seen & known, h)
         if np.isfinite(late):
             t = np.arange(len(table)) * h
             position, quaternion = (np.stack([np.interp(t + late, t, c) for c in x.T], axis=1)

@@ -60,13 +60,14 @@ BAG_GROUPS = {group: {'used': True, 'channels': [c for c in BagFlight.channels
 FORCES = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_drag',
           'axial_inflow', 'translational_lift', 'wind', 'wind_velocity', 'voltage_sag',
           'rotor_lag', 'rotor_dead_time', 'command_latency', 'imu_accelerometer_bias',
-          'imu_misalignment', 'formula')
+          'imu_misalignment', 'imu_lever_arm', 'formula')
 TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coefficient',
            'rotor_hub_moment', 'propeller_gyroscopic_torque', 'rotor_acceleration_torque')
 FEEDBACK = ('the commands explain too little of the angular acceleration: a controller that feeds '
             'back what the model lacks would be taken for the robot')
 WEIGHED = 'mass', 'inertia'
 LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
+IMU = 'imu_accelerometer_bias', 'imu_misalignment', 'imu_lever_arm'
 # Entries of the comparison of IMU and MoCap.
 SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
 Then = Callable[[Engine, Solution, dict, Starts | None, list], dict]   # adds; last: judges
@@ -200,7 +201,9 @@ def _engine(flights, robot, p, declared, alpha):
     if any(name.startswith(COMPARED) for name in channels):
         names |= set(SENSORS)
     if by_mocap(signals):
-        names = names - {'imu_accelerometer_bias', 'imu_misalignment'} | {'mocap_misalignment'}
+        names = names - {*IMU} | {'mocap_misalignment'}
+    if 'angular_velocity' not in signals:
+        names -= {'imu_lever_arm'}
     if 'position' not in signals:
         names -= {'ground_effect'}
     if not {'position', 'velocity'} & signals:

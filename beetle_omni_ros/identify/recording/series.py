@@ -197,11 +197,13 @@ def shifted(seen, felt, known, period):
     """
     Yield rows (R,) of each window, shifts in samples (S,), and squared differences by these (S,).
 
-    Arguments are those of :func:`wander`; half of the samples of a window must count.
+    Arguments are those of :func:`wander`; half of the samples of a window must count. The windows
+    of a short flight are shorter.
     """
-    reach, length = int(REACH / period), int(WINDOW / period)
+    reach = int(REACH / period)
+    length = max(min(int(WINDOW / period), (len(seen) - 2 * reach) // LEAST), 1)
     steps = np.arange(-reach, reach + 1)
-    for first in range(reach, len(seen) - length - reach, length):
+    for first in range(reach, len(seen) - length - reach + 1, length):
         rows = first + np.flatnonzero(known[first:first + length])
         if len(rows) > length / 2:
             yield rows, steps, np.array([((seen[rows + k] - felt[rows])**2).sum() for k in steps])
@@ -211,6 +213,9 @@ def wander(seen, felt, known, period):
     """
     Shift of the clock of one series against that of another, by windows.
 
+    Each window counts by the information that its motion has of the shift, which is the curvature
+    of the squared difference: a robot that hovers shows noise.
+
     Args:
         seen: (N, 3) rates of the attitude [rad/s].
         felt: (N, 3) rates of the gyroscope.
@@ -218,8 +223,8 @@ def wander(seen, felt, known, period):
         period: of the samples [s].
 
     Returns:
-        by how much ``seen`` is late in the median, and the RMS deviation of the windows from it
-        [s]; NaN and infinity if too few windows show it.
+        by how much ``seen`` is late, and the RMS deviation of the windows from it [s]; NaN and
+        infinity if too few windows show it.
 
     """
     found = []
@@ -227,8 +232,12 @@ def wander(seen, felt, known, period):
         best = int(cost.argmin())
         if 0 < best < len(steps) - 1:
             before, here, after = cost[best - 1:best + 2]
-            found.append((steps[best] + 0.5 * (before - after) / (before - 2 * here + after))
-                         * period)
+            curved = before - 2 * here + after
+            found.append(((steps[best] + 0.5 * (before - after) / curved) * period, curved))
     if len(found) < LEAST:
         return np.nan, np.inf
-    return float(np.median(found)), float(np.sqrt(np.mean((found - np.median(found))**2)))
+    late, weight = np.array(found).T
+    order = np.argsort(late)
+    share = np.cumsum(weight[order]) / weight.sum()
+    middle = late[order][np.searchsorted(share, 0.5)]
+    return float(middle), float(np.sqrt(np.average((late - middle)**2, weights=weight)))
