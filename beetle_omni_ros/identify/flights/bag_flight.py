@@ -379,10 +379,9 @@ class BagFlight:
         sizes = [self.keys[name].step for name in moved]
         # Central differences: gains, loads and inertia scaled by one factor leave the motion
         # unchanged, and with one-sided differences their slopes would not add up to zero.
-        sets = [theta, *({**theta, name: theta.get(name, 0.0) + side * h}
-                         for side in (1, -1) for name, h in zip(moved, sizes, strict=True))]
-        runs = self._servos(sets, theta)
-        ahead, behind = runs[1:].reshape(2, len(moved), *runs[0].shape)
+        runs = self._servos([{**theta, name: theta.get(name, 0.0) + side * h} for side in (1, -1)
+                             for name, h in zip(moved, sizes, strict=True)], theta)
+        ahead, behind = runs.reshape(2, len(moved), *runs[0].shape)
         slopes, changes = {}, dict(zip(moved, (behind - ahead) / (
             2 * np.reshape(sizes, (-1, 1, 1, 1))), strict=True))
         for name, change in changes.items():

@@ -191,14 +191,19 @@ class Signals:
         gap = np.maximum(self._play + more[0] + more[1:], 0.0)
 
         def make():
-            fine = self._at(self._joint, delay - late)
-            raw = self._smooth(fine, self.p.smooth_reading)
+            fine, raw = self._cached('readings', theta, names[:2],
+                                     lambda: self._readings(delay - late))
             if gap.any():
                 fine = play(fine, gap / 2)
             if self.model_tilts is not None:
                 return *self._fused_tilts(self.model_tilts, raw, gap), raw
             return tuple(self._smooth(fine, self.p.smooth_joint, k) for k in range(3)) + (raw,)
         return self._cached('joints', theta, names, make)
+
+    def _readings(self, shift):
+        """Readings of the encoders on the fine grid, and smoothed ones on the common grid."""
+        fine = self._at(self._joint, shift)
+        return fine, self._smooth(fine, self.p.smooth_reading)
 
     def drawn_reading_noise(self):
         """(N, 4) white noise of readings of the encoders, drawn and smoothed as these are."""
