@@ -159,12 +159,8 @@ class BagFlight:
         theta, own = self._real(theta)
         like = {name: self._of_all(name, own) for name in names if name in self.starts}
         ends = {name: self._ends(name, theta, own) for name, other in like.items() if not other}
-        # the servos of all at once; none of them changes a sensor
-        sets = list({frozenset(each.items()): each for each in (
-            theta, *(end for name, both in ends.items() for end in both
-                     if 'J' in self._groups_of(name)))}.items())
-        runs = self._servos([each for _, each in sets], theta)
-        self._runs = dict(zip((key for key, _ in sets), runs, strict=True))
+        self.run_servos([theta, *(end for name, both in ends.items() for end in both
+                                  if 'J' in self._groups_of(name))])
         now = self.residual(theta)
         residual = np.concatenate([now[group] for group in PLACE], axis=1)
         slopes = np.zeros((len(names), *residual.T.shape)).T
@@ -191,8 +187,12 @@ class BagFlight:
             elif name in factors:
                 key, part = factors[name]
                 slopes[:, :, k] = part * of_keys[:, :, keys.index(key)]
-        self._runs = {}
         return Linear(residual, slopes)
+
+    def run_servos(self, sets):
+        """Simulate the servos at all ``sets`` at once, none of which changes a sensor."""
+        each = {frozenset(theta.items()): theta for theta in sets}
+        self._runs = dict(zip(each, self._servos([*each.values()], sets[0]), strict=True))
 
     def _guided(self, theta, groups):
         """Residual with the tilts of the servo model at ``theta``, where they are of a model."""
@@ -327,6 +327,7 @@ class BagFlight:
         Noise in the tilts would enter the residual and the slopes of the body equations. A fit
         explains its second derivative by a larger mass of the tilting modules, for example.
         """
+        self._runs = {}
         if self.noisy:
             theta = self._real(theta)[0]
             self._use_tilts(self.signals.joints(theta)[0], self._servos([theta], theta)[0])

@@ -324,7 +324,7 @@ class Linearised:
         wide = np.hypot(self.narrow, np.concatenate([np.where(self.far, FREE, 1), np.zeros(
             len(self.names) - self.known)]) * self.typical)
         for _ in range(passes):
-            equations = normal(spectra, self.names, self.flight)
+            equations = normal(spectra, self.names, self.flight, whole=True)
             # in units of the priors, so that the sum is well conditioned
             covariance = wide[:, None] * np.linalg.inv(
                 wide[:, None] * equations.info * wide + np.eye(len(wide))) * wide
