@@ -1,7 +1,7 @@
 """Reading of rosbag2 folders (metadata.yaml and MCAP) without ROS, also of truncated files."""
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from io import BytesIO
@@ -27,6 +27,7 @@ from beetle_omni_ros.model.schema import ParameterError, read_yaml
 
 BagError = ParameterError   # its name in identify
 AT_ONCE = 4096      # messages that are read together
+MESSAGE = int(Opcode.MESSAGE)       # a number of an enumeration takes longer to compare
 HEAD, FIELDS = Struct('<BQ'), Struct('<HIQQ')   # of each record of a file, and of a message
 
 
@@ -105,6 +106,12 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         ParameterError: no such bag, unreadable, or not MCAP.
 
     """
+    for topic, kind, data, received in _recorded(path, warnings):
+        yield Recorded(topic, kind, data, from_nanoseconds(received))
+
+
+def _recorded(path, warnings):
+    """As :func:`read_messages`, topic, type, data and time [ns]."""
     readable, broken = 0, ''
     for file in bag_files(path):
         count = 0
@@ -115,9 +122,9 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         with stream:
             try:
                 read_magic(ReadDataStream(stream))
-                for topic, kind, data, received in _messages(stream, {}, {0: ''}):
+                for message in _messages(stream, {}, {0: ''}):
                     count += 1
-                    yield Recorded(topic, kind, data, from_nanoseconds(received))
+                    yield message
             except Exception as error:  # broken bytes raise anything in the library
                 if isinstance(error, InvalidMagic) and not count:
                     raise ParameterError(f'{file}: not an MCAP file') from None
@@ -137,11 +144,12 @@ def _messages(stream, topics, schemas, outside=True):
         kind, length = HEAD.unpack(head)
         if len(data := stream.read(length)) < length:
             break
-        record = ReadDataStream(BytesIO(data)) if kind != Opcode.MESSAGE else None
-        if kind == Opcode.MESSAGE:
+        if kind == MESSAGE:
             channel, _, received, _ = FIELDS.unpack_from(data)
             yield *topics[channel], data[FIELDS.size:], received
-        elif kind == Opcode.CHUNK:
+            continue
+        record = ReadDataStream(BytesIO(data))
+        if kind == Opcode.CHUNK:
             part, size = get_chunk_data_stream(Chunk.read(record), validate_crc=True)
             yield from _messages(BytesIO(part.read(size)), topics, schemas, False)
         elif kind == Opcode.CHANNEL:
@@ -164,23 +172,24 @@ def read_together(path: str | Path, warnings: list[str] | None = None
     Arguments and errors are as in :func:`read_messages`, and a ParameterError reports several
     robots. Topics are in the order of their first message.
     """
-    messages = read_messages(path, warnings)
+    messages = _recorded(path, warnings)
     spaces: set[str] = set()    # namespaces of robots
     while part := list(islice(messages, AT_ONCE)):
-        groups: dict[tuple[str, str], tuple[list, list]] = {}
+        groups: dict[tuple[str, str], tuple[list, list]] = defaultdict(lambda: ([], []))
         for topic, kind, data, received in part:
-            all_data, times = groups.setdefault((f"/{topic.lstrip('/')}", kind), ([], []))
+            all_data, times = groups[topic, kind]
             all_data.append(data)
             times.append(received)
-        spaces |= {topic.removesuffix(name).rstrip('/') for topic, _ in groups for name in TELLING
+        found = [Recorded(f"/{topic.lstrip('/')}", kind, data, from_nanoseconds(np.array(times)))
+                 for (topic, kind), (data, times) in groups.items()]
+        spaces |= {topic.removesuffix(name).rstrip('/') for topic, *_ in found for name in TELLING
                    if topic.endswith(f'/{name}')}
         if len(spaces) > 1:
             robots = ' and '.join(f"'{space}'" for space in sorted(spaces))
             raise ParameterError(f'{path}: holds several robots ({robots}); expected one')
         begin = f"{next(iter(spaces), '')}/"
-        yield [Recorded('diagnostics' if topic == '/diagnostics' else topic.removeprefix(begin),
-                        kind, data, np.array(times))
-               for (topic, kind), (data, times) in groups.items()]
+        yield [one._replace(topic='diagnostics' if one.topic == '/diagnostics'
+                            else one.topic.removeprefix(begin)) for one in found]
 
 
 def read_all(topic: Topic, messages: Sequence[bytes]) -> tuple[list[int], list, Counter]:
@@ -230,12 +239,13 @@ def read_columns(topic: Topic, messages: Sequence[bytes], channels: dict[str, in
     return np.flatnonzero(done), {name: part[done] for name, part in found.items()}, refused
 
 
-def read_bag(path: str | Path) -> FlightLog:
+def read_bag(path: str | Path, needed: Collection[str] = ()) -> FlightLog:
     """
     Read a flight.
 
     Args:
         path: rosbag2 folder, or one of its files.
+        needed: topics that are read, by default all; messages of others are only counted.
 
     Returns:
         The flight; its ``warnings`` list missing and unusable data.
@@ -251,6 +261,9 @@ def read_bag(path: str | Path) -> FlightLog:
         for messages in together:
             name = messages.topic
             if name not in ALL and not controller_of(name):
+                continue
+            if needed and name not in needed:
+                counts[name] += len(messages.data)
                 continue
             topic, refused = topic_of(name), unused.setdefault(name, Counter())
             if messages.type != topic.type:

@@ -58,7 +58,7 @@ def test_plain_and_ros_form_give_equal_parameters(tmp_path):
     ('mass: 2\ninner: 5\n', 'expected a mapping'),
     ('- 1\n', 'expected a mapping of keys'),
     ('mass: [1\n', 'not valid YAML at line'),
-    ('mass: ' + '[' * 30000 + '\n', 'recursion depth'),
+    ('mass: ' + '[' * 30000 + '\n', 'depth'),
     ('mass: 2001-13-01\n', 'not valid YAML'),
 ])
 def test_a_mistake_is_named_with_file_and_key_in_one_line(tmp_path, text, message):

@@ -159,12 +159,8 @@ class BagFlight:
         theta, own = self._real(theta)
         like = {name: self._of_all(name, own) for name in names if name in self.starts}
         ends = {name: self._ends(name, theta, own) for name, other in like.items() if not other}
-        # the servos of all at once; none of them changes a sensor
-        sets = list({frozenset(each.items()): each for each in (
-            theta, *(end for name, both in ends.items() for end in both
-                     if 'J' in self._groups_of(name)))}.items())
-        runs = self._servos([each for _, each in sets], theta)
-        self._runs = dict(zip((key for key, _ in sets), runs, strict=True))
+        self.run_servos([theta, *(end for name, both in ends.items() for end in both
+                                  if 'J' in self._groups_of(name))])
         now = self.residual(theta)
         residual = np.concatenate([now[group] for group in PLACE], axis=1)
         slopes = np.zeros((len(names), *residual.T.shape)).T
@@ -191,8 +187,12 @@ class BagFlight:
             elif name in factors:
                 key, part = factors[name]
                 slopes[:, :, k] = part * of_keys[:, :, keys.index(key)]
-        self._runs = {}
         return Linear(residual, slopes)
+
+    def run_servos(self, sets):
+        """Simulate the servos at all ``sets`` at once, none of which changes a sensor."""
+        each = {frozenset(theta.items()): theta for theta in sets}
+        self._runs = dict(zip(each, self._servos([*each.values()], sets[0]), strict=True))
 
     def _guided(self, theta, groups):
         """Residual with the tilts of the servo model at ``theta``, where they are of a model."""
@@ -327,6 +327,7 @@ class BagFlight:
         Noise in the tilts would enter the residual and the slopes of the body equations. A fit
         explains its second derivative by a larger mass of the tilting modules, for example.
         """
+        self._runs = {}
         if self.noisy:
             theta = self._real(theta)[0]
             self._use_tilts(self.signals.joints(theta)[0], self._servos([theta], theta)[0])
@@ -379,10 +380,9 @@ class BagFlight:
         sizes = [self.keys[name].step for name in moved]
         # Central differences: gains, loads and inertia scaled by one factor leave the motion
         # unchanged, and with one-sided differences their slopes would not add up to zero.
-        sets = [theta, *({**theta, name: theta.get(name, 0.0) + side * h}
-                         for side in (1, -1) for name, h in zip(moved, sizes, strict=True))]
-        runs = self._servos(sets, theta)
-        ahead, behind = runs[1:].reshape(2, len(moved), *runs[0].shape)
+        runs = self._servos([{**theta, name: theta.get(name, 0.0) + side * h} for side in (1, -1)
+                             for name, h in zip(moved, sizes, strict=True)], theta)
+        ahead, behind = runs.reshape(2, len(moved), *runs[0].shape)
         slopes, changes = {}, dict(zip(moved, (behind - ahead) / (
             2 * np.reshape(sizes, (-1, 1, 1, 1))), strict=True))
         for name, change in changes.items():

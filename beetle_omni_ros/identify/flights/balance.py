@@ -14,7 +14,7 @@ from itertools import product
 from math import log
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from beetle_omni_ros.identify.flights.evidence import least_size, Posterior, SCALES
 from beetle_omni_ros.identify.flights.keys import entries_of, keys_of, prior_of
@@ -23,7 +23,7 @@ from beetle_omni_ros.model.parameters import RobotParameters
 SLOW = {'rotor_thrust_coefficient', 'rotor_hub_moment', 'centre_of_mass'}
 SESSION = 0.035     # of a rotor's thrust between sessions: 0.3 g, normal flights of CrazyPAD
 FREEDOM = 9         # of this scatter, four flights and three axes: its prior is a Student's t
-SCATTER = SESSION * np.sqrt(FREEDOM / chi2.ppf((np.arange(8) + 0.5) / 8, FREEDOM))
+SCATTER = SESSION * np.sqrt(FREEDOM / chdtri(FREEDOM, (np.arange(8)[::-1] + 0.5) / 8))
 
 
 class Balance:

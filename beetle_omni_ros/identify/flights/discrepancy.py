@@ -62,8 +62,11 @@ def of_thrusts(robot: RobotParameters, tilt: np.ndarray) -> tuple[np.ndarray, np
 
 def placed(slopes: np.ndarray, channels: Sequence[str]) -> np.ndarray:
     """Slopes (N, 6, ...) of forces and torques as those of all channels (N, C, ...)."""
-    return np.stack([slopes[:, BODY.index(name)] if name in BODY else 0 * slopes[:, 0]
-                     for name in channels], axis=1)
+    made = np.zeros((len(channels), len(slopes), *slopes.shape[2:]))
+    for own, name in zip(made, channels, strict=True):
+        if name in BODY:
+            own[:] = slopes[:, BODY.index(name)]
+    return made.swapaxes(0, 1)
 
 
 def laws(flights: Sequence) -> tuple[list[np.ndarray], list[slice]]:

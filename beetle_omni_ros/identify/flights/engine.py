@@ -36,7 +36,7 @@ class Engine(Linearised):
         turn = 0
         while True:
             turn += 1
-            spectra = self._linearised(theta, etas, spectra)
+            spectra = self._linearised(theta, etas, spectra, spectra if turn == 1 else None)
             solution = self._steady(spectra)
             own = sorted(self.indices(solution.best))
             step = np.abs(solution.theta[own] - theta[own])

@@ -73,7 +73,7 @@ class Normal:
 
 def normal(spectra: Sequence[Spectrum], names: list[str], flight: np.ndarray,
            split: np.ndarray = NONE, groups: np.ndarray = NONE,
-           generic: np.ndarray | None = None) -> Normal:
+           generic: np.ndarray | None = None, whole: bool = False) -> Normal:
     """
     Eliminate the deviations of each flight.
 
@@ -84,6 +84,7 @@ def normal(spectra: Sequence[Spectrum], names: list[str], flight: np.ndarray,
         split: indices of keys that get a further deviation for each group of bands.
         groups: (bands,) group of each band, from 0.
         generic: standard deviations of the last keys, which are eliminated too; None: kept.
+        whole: whether the scores are those of flights, not of their blocks.
 
     Returns:
         normal equations; the deviations of split keys follow the K keys.
@@ -97,6 +98,7 @@ def normal(spectra: Sequence[Spectrum], names: list[str], flight: np.ndarray,
     scores, slopes, flights = [], [], []
     for each in spectra:
         g, h = each.grams(groups if len(split) else NONE)
+        g, h = (part.sum(axis=0, keepdims=True) for part in (g, h)) if whole else (g, h)
         gs, hs = np.zeros((len(g), size, size)), np.zeros((len(g), size))
         gs[:, :count, :count], hs[:, :count] = g.sum(axis=1), h.sum(axis=1)
         for group in range(copies if len(split) else 0):
@@ -119,9 +121,9 @@ def normal(spectra: Sequence[Spectrum], names: list[str], flight: np.ndarray,
         right += hs.sum(axis=0) - left.T @ a
         noise += gs.sum(axis=0) - left.T @ inner @ left - project * flight[own]**-2 @ project.T
         flights.append((own, inner, left, right_e))
-    whole = Normal(list(names), info, right, np.concatenate(scores), np.concatenate(slopes),
+    found = Normal(list(names), info, right, np.concatenate(scores), np.concatenate(slopes),
                    noise, flights)
-    return whole if generic is None else _without(whole, count, generic)
+    return found if generic is None else _without(found, count, generic)
 
 
 def _without(whole, count, generic):
@@ -193,6 +195,9 @@ class Judge:
         self.always = tuple(np.flatnonzero(kept))
         self.covariance = np.linalg.inv(equations.info + np.diag(narrow**-2))
         self.mean = self.covariance @ equations.right
+        # scores of blocks at the mean, and how those of the keys change them
+        self._scores = equations.scores - equations.slopes @ self.mean
+        self._slopes = equations.slopes @ self.covariance
         self.blocks = len(equations.scores)
         self.owner, self.far, self.acting = owner, far, acting
         self.student = 1.0 if level is None else few_blocks(level, self.blocks)
@@ -255,8 +260,8 @@ class Judge:
         slab = np.where(self.acting[c], EXACT, np.hypot(
             self.narrow[c], self._scales(c, estimate) * self.typical[c]))
         fitted = np.linalg.solve(info + np.diag(slab**-2), score + self.acting[c] * slab**-2)
-        theta = self.mean + direction @ (fitted - self.mean[c])
-        wide = self.widened(direction, info, theta)
+        scores = self._scores - self._slopes[:, :, c] @ (own @ (fitted - self.mean[c]))
+        wide = self._widened(direction, info, scores @ direction)
         self._profiles[index] = c, estimate, wide, direction, slab
         return self._profiles[index]
 
@@ -275,14 +280,13 @@ class Judge:
                 group[own] = np.searchsorted((1.5, 4.5), ratio[own].max())
         return np.array(SCALES)[group]
 
-    def widened(self, direction, info, theta):
+    def _widened(self, direction, info, scores):
         """
         (d, d) covariance of a profile, widened where blocks scatter more than their noise.
 
         Only the part of the covariance is widened that the noise causes. The part by deviations
         of flights and by other keys is known from their priors.
         """
-        scores = (self.equations.scores - self.equations.slopes @ theta) @ direction
         scatter = scores.T @ scores * self.blocks / max(self.blocks - 1, 1)
         noise = direction.T @ self.equations.noise @ direction
         root, less, _ = positive(noise, np.maximum(np.diag(noise), 1e-300)**-0.5)

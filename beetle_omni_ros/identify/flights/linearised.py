@@ -219,11 +219,11 @@ class Linearised:
         power = np.diagonal(noise, axis1=1, axis2=2)[:spectrum.band[-1] + 1]
         return whitening(power, self.flights[0].period)
 
-    def _linearised(self, theta, etas, before):
-        """Spectra at a point; their noise begins at that of the spectra ``before``."""
+    def _linearised(self, theta, etas, before, made=None):
+        """Spectra at a point, or ``made`` ones; their noise begins at that of those ``before``."""
         self._settle(theta, etas)
         self.acting, self.point = self.curved & (theta[:self.known] == 1), theta
-        spectra = self._spectra(theta, etas)
+        spectra = made or self._spectra(theta, etas)
         moves = [k for k, name in enumerate(self.names) if name.startswith(MOVES)]
         for each, still, balanced in zip(spectra, self.still, self.balanced, strict=True):
             each.hidden = still
@@ -239,7 +239,7 @@ class Linearised:
         The point ``theta``, with starts moved to their fitted values, or a part of the way there.
 
         A secant is valid up to its start, and a slope for typical sizes. If the step is larger,
-        the ``part`` of it is made which leaves least of the flights.
+        a ``part`` of it is made: smaller ones are tried as long as less is left of the flights.
         """
         step = theta - self.point
         step[:self.known][self.curved] = 0.0
@@ -258,6 +258,8 @@ class Linearised:
             left = sum(self._left(k, at + eta, found) for k, (eta, found) in enumerate(
                 zip(etas, spectra, strict=True)))
             points.append((left, part, at, {name: dict(start) for name, start in starts.items()}))
+            if left > min(point[0] for point in points):
+                break
         _, self.part, theta, moved = min(points, key=lambda point: point[0])
         starts.update(moved)
         self._last.clear()      # was made at the starts before
@@ -335,7 +337,7 @@ class Linearised:
         wide = np.hypot(self.narrow, np.concatenate([np.where(self.far, FREE, 1), np.zeros(
             len(self.names) - self.known)]) * self.typical)
         for _ in range(passes):
-            equations = normal(spectra, self.names, self.flight)
+            equations = normal(spectra, self.names, self.flight, whole=True)
             # in units of the priors, so that the sum is well conditioned
             covariance = wide[:, None] * np.linalg.inv(
                 wide[:, None] * equations.info * wide + np.eye(len(wide))) * wide

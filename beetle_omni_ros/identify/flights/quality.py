@@ -18,8 +18,7 @@ from dataclasses import dataclass
 from math import log
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_law
+from scipy.special import chdtrc, fdtrc
 
 from beetle_omni_ros.identify.flights.discrepancy import laws, placed
 from beetle_omni_ros.identify.flights.engine import Engine
@@ -272,7 +271,7 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
                       for k in places])
     k, c = np.unravel_index(ratio.argmax(), ratio.shape)
     sides = NEAR - 1
-    chance = float(f_law.sf(ratio[k, c], blocks, blocks * sides)) * ratio.size
+    chance = float(fdtrc(blocks, blocks * sides, ratio[k, c])) * ratio.size
     order = np.argsort(-ratio[k])
     return Unexplained('line', min(chance, 1.0), float(blocks * (
         ratio[k, c] - 1 - np.log(ratio[k, c])) / 2), tuple(channels[own[i]] for i in order[:2]),
@@ -298,7 +297,7 @@ def beyond(engine: Engine, solution: Solution) -> Unexplained:
         'modules.share': ('the effect of the tilting modules', f'{100 * off:.2g} %'),
     }.get(effect, (effect, f'{off:.2g}'))
     return Unexplained(
-        'tolerance', min(1.0, len(own) * float(chi2.sf(most**2, 1))), float(sizes @ sizes) / 2, (),
+        'tolerance', min(1.0, len(own) * float(chdtrc(1, most**2))), float(sizes @ sizes) / 2, (),
         number=f'{what}, which is off by {size}, {most:.0f} standard deviations of its tolerance')
 
 

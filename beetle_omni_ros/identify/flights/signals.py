@@ -4,7 +4,6 @@ from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.flights.keys import base_of, names_of, OF_ONE, THRUST_BUS, TILT_BUS
@@ -17,6 +16,7 @@ from beetle_omni_ros.identify.recording.series import (
     EDGE,
     held_at,
     integral,
+    lagged,
     low_pass,
     matrices,
     spread,
@@ -191,14 +191,19 @@ class Signals:
         gap = np.maximum(self._play + more[0] + more[1:], 0.0)
 
         def make():
-            fine = self._at(self._joint, delay - late)
-            raw = self._smooth(fine, self.p.smooth_reading)
+            fine, raw = self._cached('readings', theta, names[:2],
+                                     lambda: self._readings(delay - late))
             if gap.any():
                 fine = play(fine, gap / 2)
             if self.model_tilts is not None:
                 return *self._fused_tilts(self.model_tilts, raw, gap), raw
             return tuple(self._smooth(fine, self.p.smooth_joint, k) for k in range(3)) + (raw,)
         return self._cached('joints', theta, names, make)
+
+    def _readings(self, shift):
+        """Readings of the encoders on the fine grid, and smoothed ones on the common grid."""
+        fine = self._at(self._joint, shift)
+        return fine, self._smooth(fine, self.p.smooth_reading)
 
     def drawn_reading_noise(self):
         """(N, 4) white noise of readings of the encoders, drawn and smoothed as these are."""
@@ -244,11 +249,8 @@ class Signals:
             mean = self._cached(('commands', delay), theta, LAGS[1:2],
                                 lambda: self._mean_commands(delay, limit))
             tau = self.robot.rotors.time_constant * np.exp(lag + np.array(own))
-            keep = np.exp(-self._step / tau)
-            lagged = np.stack([lfilter([1 - k], [1, -k], column, zi=k * column[:1])[0]
-                               for k, column in zip(keep, mean.T, strict=True)], axis=1)
             places = np.rint((self.t - self._begin) / self._step).astype(int) - 1
-            force = lagged[places]
+            force = lagged(mean, np.exp(-self._step / tau))[places]
             return force, (mean[places + 1] - force) / tau
         return self._cached(('thrust', delay), theta, LAGS, make)
 

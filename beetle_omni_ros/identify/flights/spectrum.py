@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import dct
-from scipy.signal import fftconvolve
+
+from beetle_omni_ros.identify.recording.series import filtered
 
 BLOCK = 8.0         # [s] of a block: longer than the memory of a flight controller
 # [Hz] of the bands; the first is the mean alone
@@ -136,11 +137,11 @@ class Spectrum:
                 (blocks, most, len(channels)))
             for k, own in enumerate(self._bands(most)):
                 lost = [c for band, hidden in self.hidden if band == k for c in hidden]
-                seen = np.flatnonzero(~np.isin(channels, lost))
+                seen, root = np.flatnonzero(~np.isin(channels, lost)), np.zeros(s.shape[2:3] * 2)
                 noise = self.noise[k][np.ix_(channels[seen], channels[seen])]
-                root = np.linalg.inv(np.linalg.cholesky(noise))
-                s[:, own][:, :, seen] = root @ slopes[:, own][:, :, seen]
-                r[:, own][..., seen] = self.residual[:, own][..., channels[seen]] @ root.T
+                root[np.ix_(seen, seen)] = np.linalg.inv(np.linalg.cholesky(noise))
+                np.matmul(root, slopes[:, own], out=s[:, own])
+                r[:, own] = self.residual[:, own][..., channels] @ root.T
             edges = np.searchsorted(groups[self.band[:most]] if len(groups) else np.zeros(most),
                                     np.arange(copies + 1))
             for block in range(blocks):
@@ -192,8 +193,8 @@ class Spectrum:
                 e = e.reshape(count, len(channels)) + j @ x[keys]
                 total = e.T @ e
                 if len(j) < MANY * len(keys):
-                    w = j @ of_keys
-                    total = total + np.einsum('nck,ndk->cd', w, j, optimize=True)
+                    w = (j.reshape(-1, len(keys)) @ of_keys).reshape(j.shape)
+                    total = total + (w @ j.transpose(0, 2, 1)).sum(axis=0)
                 totals.append(total)
                 counts.append(len(j))
             if self.level:
@@ -290,7 +291,7 @@ def _whitened(series, there, kernel):
     left, right = there[left], there[right]
     part = np.clip((t - left) / np.maximum(right - left, 1), 0, 1)
     series = series[left] + part[:, None] * (series[right] - series[left])
-    return fftconvolve(series, kernel[:, None], axes=0)[:len(t)]
+    return filtered(kernel, series)
 
 
 def whitening(power: np.ndarray, period: float) -> np.ndarray:

@@ -144,15 +144,15 @@ def first_point(models, every, robot):
     The file's tilting modules are used if servos and forces agree better with them, at any
     latency. From no latency, a linear fit takes a large one for servos with less stiffness.
     """
-    costs = {}
+    costs, points = {}, [{'command_latency.delay': late} for late in LATE]
     for share in (0.0, 1.0) if robot.multibody is not None else (0.0,):
         for model in models:
             model.modules = share
             model.settle({})
-        for late in LATE:
-            costs[share, late] = sum(
-                float(np.log(r.var(axis=0)).sum()) for model in models
-                for r in model.residual({'command_latency.delay': late}, 'BJ').values())
+            model.run_servos(points)
+        for late, point in zip(LATE, points, strict=True):
+            costs[share, late] = sum(float(np.log(r.var(axis=0)).sum()) for model in models
+                                     for r in model.residual(point, 'BJ').values())
     share, late = min(costs, key=lambda point: costs[point])
     for model in every:
         model.modules = share

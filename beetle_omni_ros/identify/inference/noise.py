@@ -6,9 +6,7 @@ from itertools import product
 from math import exp, inf, log, log1p, pi
 
 import numpy as np
-from scipy.special import log_ndtr
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import log_ndtr, ndtri, stdtrit
 
 HUBER = 3.0                 # standard deviations from which the loss is linear
 SIGMA_OF_MEDIAN = 1.4826    # standard deviation over the median of the size, normal distribution
@@ -58,7 +56,7 @@ def jackknife(fit: Callable[[np.ndarray], np.ndarray], blocks: np.ndarray) -> np
 def interval(every: np.ndarray) -> np.ndarray:
     """95 % interval (2,) of a value from the results (1 + B,) of :func:`jackknife`."""
     count = len(every) - 1
-    half = student.ppf(0.975, count - 1) * np.sqrt((count - 1) * every[1:].var())
+    half = stdtrit(count - 1, 0.975) * np.sqrt((count - 1) * every[1:].var())
     return every[0] + half * np.array([-1, 1])
 
 
@@ -132,7 +130,7 @@ def drifting(residuals: list[np.ndarray], signals: list[np.ndarray], slowest: in
 
 def few_blocks(level: float, blocks: int) -> float:
     """Factor of a variance because the scatter of few blocks is uncertain: Student's t."""
-    return float((student.isf(level / 2, max(blocks - 1, 1)) / norm.isf(level / 2))**2)
+    return float((stdtrit(max(blocks - 1, 1), level / 2) / ndtri(level / 2))**2)
 
 
 @lru_cache(100_000)      # the same priors end at the same bounds in most sets

@@ -11,7 +11,7 @@ from beetle_omni_ros.bags.log import CHANNELS, FlightLog, SERIES
 from beetle_omni_ros.model.parameters import JOINT_NAMES
 
 NEEDED = IMU, POSE, JOINTS, COMMAND = 'imu/data_raw', 'mocap/pose', 'joint_states', 'command'
-BATTERY = 'battery_state'
+BATTERY, STATE = 'battery_state', 'supervisor/state'
 # topic -> the columns of its table
 PARTS = {topic: CHANNELS[topic] for topic in NEEDED} | {
     JOINTS: {'position': 4}, BATTERY: {'voltage': 1}}
@@ -55,7 +55,7 @@ def read_recording(path: str | Path) -> Recording:
         BagError: no such bag, unreadable bag, several robots, or another robot.
 
     """
-    log = read_bag(path)
+    log = read_bag(path, (*PARTS, STATE))
     if not len(log.joint) and not len(log.command):
         raise BagError(f'{path}: no recording of this robot: expected {", ".join(NEEDED)}, with '
                        f'joints {", ".join(JOINT_NAMES)}; {"; ".join(log.warnings)}')
