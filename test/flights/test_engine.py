@@ -33,14 +33,14 @@ def motor_volts(thrust):
 
 
 def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0, late=0.0, bias=0.0,
-                 wander=0.002, wind=(0.0, 0.0, 0.0)):
+                 wander=0.002, wind=(0.0, 0.0, 0.0), hub=0.0, lever=(0.0, 0.0, 0.0)):
     """
     A flight in the columns of NanoBench, from equations of its own.
 
     The motion is prescribed; attitude and commands are those that it needs. Thrust by motor
     voltage with a lag of 60 ms. MoCap is ``late`` (a number or (N,)) [s], and the accelerometer
-    has a vertical ``bias`` [m/s^2] and a random walk of ``wander`` a sample. ``wind`` is a force
-    in world [N].
+    has a vertical ``bias`` [m/s^2] and a random walk of ``wander`` a sample, and is at ``lever``
+    [m]. ``wind`` is a force in world [N], and ``hub`` the moment of the rotors by speed [N s].
     """
     rng = np.random.default_rng(seed)
     t = np.arange(-1, seconds + 1, 0.01)        # derivatives at the ends are cut off
@@ -61,7 +61,10 @@ def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0, late=0
     q = Rotation.from_matrix(matrix)
     rates = np.pad((q[:-2].inv() * q[2:]).as_rotvec() / 0.02, ((1, 1), (0, 0)), mode='edge')
     inertia = np.array([16.571710e-6, 16.655602e-6, 29.261652e-6])
-    torque = inertia * np.gradient(rates, 0.01, axis=0) + np.cross(rates, inertia * rates)
+    turning = np.gradient(rates, 0.01, axis=0)
+    along = np.einsum('nji,nj->ni', matrix, v)
+    torque = inertia * turning + np.cross(rates, inertia * rates) \
+        + hub * np.cross(along, [0, 0, 1])
     arm, ratio = 0.03253, 0.00596
     wrench = np.array([[1, 1, 1, 1], [-arm, -arm, arm, arm], [-arm, arm, arm, -arm],
                        [-ratio, ratio, -ratio, ratio]])
@@ -70,7 +73,8 @@ def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0, late=0
     force = lagged + 0.06 * np.gradient(lagged, 0.01, axis=0)
     volts = 4.0 - 0.5 * t / seconds - 0.05 * rng.random()
     duty = motor_volts(force) / (volts[:, None] if sag else 3.7)
-    specific = np.einsum('nji,nj->ni', matrix, need) / 0.0319 + [0, 0, bias]
+    specific = np.einsum('nji,nj->ni', matrix, need) / 0.0319 + [0, 0, bias] \
+        + np.cross(turning, lever) + np.cross(rates, np.cross(rates, lever))
     # coloured noise: white and a slow wander
     noise = rng.normal(size=(len(t), 3)) * 0.05 + np.cumsum(
         rng.normal(size=(len(t), 3)), axis=0) * wander
@@ -111,6 +115,21 @@ def test_a_hidden_thrust_and_drag_are_named_with_their_sizes(tmp_path, capsys):
     *_, then, last = capsys.readouterr().out.splitlines()
     assert then == f'next:  open {page} in a browser' and '--report' not in last
     assert last.startswith('next:  the same with --apply FILE')
+
+
+def test_torques_that_balance_a_known_moment_show_it_although_the_robot_hardly_turns(tmp_path):
+    flights = [write_flight(tmp_path / f'{k}.csv', k, hub=5e-4) for k in range(2)]
+    effect, = gap_of(flights)['effects']
+    low, high = effect['parameters']['coefficient']['interval']
+    assert effect['names'] == ['rotor_hub_moment'] and low < 5e-4 < high < 8e-4
+
+
+def test_an_accelerometer_beside_the_centre_of_mass_is_told_with_its_place(tmp_path):
+    lever = np.array([0.0, 0.012, -0.008])
+    result = gap_of([write_flight(tmp_path / f'{k}.csv', k, lever=lever) for k in range(2)])
+    effect, = result['effects']
+    low, high = np.transpose(effect['parameters']['offset']['interval'])
+    assert effect['names'] == ['imu_lever_arm'] and ((low < lever) & (lever < high)).all()
 
 
 @pytest.fixture
@@ -274,6 +293,15 @@ def test_a_late_clock_of_mocap_is_measured_and_taken_out(tmp_path, late):
     flight, = load_tables([path], model, form)
     away = flight._seen[200:-200, 3:] - flight.measured({})[200:-200, -3:]
     assert not flight.apart and away.std() < 0.2 * felt.std()
+
+
+@pytest.mark.parametrize('still', [0.0, 12.0])
+def test_a_clock_is_known_from_where_the_robot_turns_also_in_a_short_flight(still):
+    rng, t = np.random.default_rng(3), np.arange(0, 6 + still, 0.01)
+    felt = np.stack([np.sin(5 * t), np.cos(4 * t), 0 * t], axis=1) * (t < 6)[:, None]
+    seen, felt = (x + 0.05 * rng.normal(size=x.shape) for x in (np.roll(felt, 3, axis=0), felt))
+    late, deviation = wander(seen, felt, np.ones(len(t), dtype=bool), 0.01)
+    assert late == pytest.approx(0.03, abs=0.002) and deviation < 0.005
 
 
 def test_a_clock_that_wanders_takes_out_the_pair_and_not_the_flight(tmp_path):

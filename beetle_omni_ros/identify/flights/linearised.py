@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -26,7 +27,7 @@ FORM = 0.25             # relative error of an entry by its form
 # a factor by less than the error of form.
 MOVED = 1 / (1 + FORM**2)
 DRIVES = 'thrust_coefficient.scale'     # key whose slopes are what the commands cause
-MOVES = 'inertia.inertia'       # keys whose slopes are the acceleration itself
+BY_MOTION = 'rotor_hub_moment.coefficient'      # key of a torque that does not act by commands
 IN_LOOP = 'force', 'torque', 'acceleration', 'rate', 'joint'  # noise of these reaches commands
 DYNAMIC = range(1, len(EDGES))   # bands without the mean
 SAME = 0.04             # share of a typical difference between flights by which one value varies
@@ -160,12 +161,12 @@ class Linearised:
         self._find_motion(spectra, theta, etas)
         return spectra
 
-    @property
-    def without_motion(self) -> list[str]:
-        """Groups of channels that show only means in every flight."""
+    def without_motion(self, *more: list) -> list[str]:
+        """Groups of channels that show only means in every flight, or ``more`` bands."""
+        found = [[*chain(*lists)] for lists in zip(self.still, *more, strict=True)]
         return [kind for kind, own in self._in_loop()
-                if all(sum(each == own for _, each in still) == len(DYNAMIC)
-                       for still in self.still)]
+                if all({band for band, each in still if each == own} >= {*DYNAMIC}
+                       for still in found)]
 
     def _in_loop(self):
         """Kinds of channels with noise that reaches the commands, and their indices."""
@@ -180,9 +181,9 @@ class Linearised:
         A controller at rest answers noise. Then motion and commands correlate with the noise of
         the sensors, and a fit takes the answer for the robot. Where IMU and MoCap show that the
         robot turns, what the model leaves is no noise, and counts. Joints may rest there, and
-        the noise of their readings, which is known, hides them. Where the commands are large and
-        the acceleration is not, they balance known forces. These count, and only the inertia is
-        not known there.
+        the noise of their readings, which is known, hides them. Where the commands of a table are
+        large and the acceleration is not, they balance a torque by the motion. It is known there.
+        What acts by commands is not: less of everything would be less of their noise.
         """
         fit, equations = self._learn(spectra)
         self.still, self.balanced = [], []
@@ -191,12 +192,10 @@ class Linearised:
             whole = self.transformed(k, flight.measured(values)).residual
             rest = each.at(fit + equations.of_flight(k, fit))
             bands = {kind: self._hidden(each, own, rest, whole) for kind, own in self._in_loop()}
-            driven = {}
+            balanced: list[int] = []
             if not flight.turning:      # what the model lacks is more than the noise
                 bands = {kind: bands.get(kind, []) for kind in flight.fed_back}
-                caused = each.by(self.names.index(DRIVES)) if DRIVES in self.names else whole
-                driven = {kind: set(bands[kind]) - {*self._hidden(each, own, rest, caused)}
-                          for kind, own in self._in_loop() if kind in bands}
+                balanced, bands['torque'] = self._balanced(each, rest, bands['torque'])
             elif len(bands[flight.turning]) < len(DYNAMIC):
                 bands |= dict.fromkeys(('force', 'torque', 'joint'), [])
             if flight.turning:      # its answer biases gains by less than servos differ
@@ -204,10 +203,21 @@ class Linearised:
                 bands['joint'] = sorted({*bands['joint'], *self._hidden(
                     each, dict(self._in_loop())['joint'], noise, whole,
                     flight.p.tolerance_lag**2)})
-            for found, chosen in ((self.still, lambda kind: {*bands.get(kind, [])} - {
-                    *driven.get(kind, [])}), (self.balanced, lambda kind: driven.get(kind, []))):
-                found.append([(band, own) for kind, own in self._in_loop()
-                              for band in sorted(chosen(kind))])
+            self.still.append([(band, own) for kind, own in self._in_loop()
+                               for band in bands.get(kind, [])])
+            self.balanced.append([(band, own) for kind, own in self._in_loop()
+                                  if kind == 'torque' for band in balanced])
+
+    def _balanced(self, spectrum, rest, hidden):
+        """Bands of the ``hidden`` ones in which commands balance torques, and the others."""
+        own = dict(self._in_loop()).get('torque', [])
+        if DRIVES not in self.names or not own:
+            return [], hidden
+        caused = self._hidden(spectrum, own, rest, spectrum.by(self.names.index(DRIVES)))
+        balanced = [band for band in hidden if band not in caused]
+        # rotors scatter, so that means of torques show nothing beside such bands alone
+        alone = [0] if balanced and len(hidden) == len(DYNAMIC) else []
+        return balanced, alone + [band for band in hidden if band in caused]
 
     def _hidden(self, spectrum, own, rest, whole, most=1 - MOVED):
         """Bands in which ``rest`` is more than this share of the channels ``own`` of ``whole``."""
@@ -224,10 +234,10 @@ class Linearised:
         self._settle(theta, etas)
         self.acting, self.point = self.curved & (theta[:self.known] == 1), theta
         spectra = made or self._spectra(theta, etas)
-        moves = [k for k, name in enumerate(self.names) if name.startswith(MOVES)]
+        other = [k for k, name in enumerate(self.names[:self.known]) if name != BY_MOTION]
         for each, still, balanced in zip(spectra, self.still, self.balanced, strict=True):
             each.hidden = still
-            each.forget(moves, balanced)
+            each.forget(other, balanced)
         self.narrow[self.known:] = self.start[self.known:]
         for each, last in zip(spectra, before, strict=True):
             each.noise = last.noise

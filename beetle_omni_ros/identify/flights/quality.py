@@ -309,7 +309,7 @@ def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
     what repeats may be its answer; nothing is tested there.
     """
     own = [c for c in solution.spectra[0].parts[0][0]
-           if engine.channels[c].split('_')[0] not in engine.without_motion]
+           if engine.channels[c].split('_')[0] not in engine.without_motion()]
     if solution.banned or not own:
         return []
     left = [found.at(fitted(engine, solution, k)) for k, found in enumerate(solution.spectra)]

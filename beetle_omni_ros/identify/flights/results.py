@@ -115,7 +115,7 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
         (effect['evidence']['ln_bayes_factor'] for effect in effects), default=0.0), likely)
     return result_of(
         verdict, {**groups, **{kind: groups[kind] | {'reason': STILL}
-                               for kind in engine.without_motion}}, reason,
+                               for kind in engine.without_motion()}}, reason,
         effects=[effect for effect, members in zip(effects, sets, strict=True)
                  if verdict in NAMING and len(members) < CROWD],
         partial=[effect for effect, members in zip(effects, sets, strict=True)

@@ -92,9 +92,9 @@ class Spectrum:
         """Let these keys have no slope in some bands and channels."""
         for channels, own, slopes in self.parts:
             for band, lost in bands:
-                at = self.band[:slopes.shape[1]] == band
-                slopes[np.ix_(range(len(slopes)), at, np.isin(channels, lost),
-                              np.isin(own, keys))] = 0.0
+                rows = np.flatnonzero(self.band[:slopes.shape[1]] == band)
+                gone = np.isin(channels, lost)[:, None] & np.isin(own, keys)
+                slopes[:, rows] *= ~gone
 
     def joined(self, copies: list[tuple[int, int, list[int]]], other: Spectrum, count: int
                ) -> Spectrum:

@@ -61,8 +61,9 @@ FORCES = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_dra
           'axial_inflow', 'translational_lift', 'wind', 'wind_velocity', 'voltage_sag',
           'rotor_lag', 'rotor_dead_time', 'command_latency', 'imu_accelerometer_bias',
           'imu_misalignment', 'imu_lever_arm', 'formula')
-TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coefficient',
-           'rotor_hub_moment', 'propeller_gyroscopic_torque', 'rotor_acceleration_torque')
+HUB = 'rotor_hub_moment'
+TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coefficient', HUB,
+           'propeller_gyroscopic_torque', 'rotor_acceleration_torque')
 FEEDBACK = ('the commands explain too little of the angular acceleration: a controller that feeds '
             'back what the model lacks would be taken for the robot')
 WEIGHED = 'mass', 'inertia'
@@ -193,11 +194,11 @@ def _delays(robot, p, coarse):
     return deviations, limits
 
 
-def _engine(flights, robot, p, declared, alpha):
+def _engine(flights, robot, p, declared, alpha, torques=TORQUES):
     """Engine of flights of tables with the entries that channels and signals can show."""
     channels, signals, names = flights[0].channels, set(declared.signals), set(FORCES)
     if any(name.startswith('torque') for name in channels):
-        names |= set(TORQUES)
+        names |= set(torques)
     if any(name.startswith(COMPARED) for name in channels):
         names |= set(SENSORS)
     if by_mocap(signals):
@@ -276,11 +277,13 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
         for flight in [*flights, *judging] if flight.apart]
     engine, keys = _engine(usable, robot, p, declared, alpha)
     solution = engine.run()
-    if 'torque' in engine.without_motion:   # rotors scatter, so that means of torques show nothing
-        for flight in [*usable, *judging]:
-            flight.without(('torque',), FEEDBACK)
-        groups = _groups(usable[0], declared)
-        engine, keys = _engine(usable, robot, p, declared, alpha)
+    if 'torque' in engine.without_motion(engine.balanced):
+        # rotors scatter, so that means of torques show nothing
+        if 'torque' in engine.without_motion():
+            for flight in [*usable, *judging]:
+                flight.without(('torque',), FEEDBACK)
+            groups = _groups(usable[0], declared)
+        engine, keys = _engine(usable, robot, p, declared, alpha, (HUB,))
         solution = engine.run()
     judges = [flight for flight in judging if flight.usable] or usable
     slow = [part for f in usable if (part := f.balance(list(keys_of(robot, SLOW))))]
