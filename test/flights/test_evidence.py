@@ -135,6 +135,16 @@ def test_bounds_of_keys_that_are_nearly_the_same_leave_a_finite_evidence():
         assert np.isfinite([value, *mean, *covariance.ravel()]).all()
 
 
+def test_noise_that_rounding_makes_negative_does_not_widen_what_is_known():
+    found, never = normal([linear_flight(np.random.default_rng(6), np.zeros(2), keys=2)],
+                          ['a', 'b'], np.zeros(2)), np.zeros(2, dtype=bool)
+    found.noise[1] = found.noise[:, 1] = 0.0
+    found.noise[1, 1] = -1e-14
+    judge = Judge(found, np.full(2, 0.001), np.full(2, 0.02), np.full((2, 2), [-np.inf, np.inf]),
+                  never, np.arange(2), 0.05, never, np.zeros(2))
+    assert judge.posterior((0, 1)).covariance.diagonal() == pytest.approx([0.0, 0.0], abs=0.02**2)
+
+
 @pytest.mark.parametrize('unit', [1e-6, 1e6])
 def test_evidence_is_the_same_in_all_units(unit):
     rng, never = np.random.default_rng(6), np.zeros(2, dtype=bool)
