@@ -90,11 +90,36 @@ def test_a_delay_far_beyond_its_tolerance_has_one_value_in_all_bands():
         names=['delay'], entries=[Entry('delay', ('delay',))], index={'delay': 0}, known=1,
         narrow=np.array([0.0025]), typical=np.array([0.01]), flight=np.zeros(1), late={},
         bounds=np.array([[0.0, 0.004]]), kept=np.array([True]), owner=np.zeros(1, dtype=int),
-        far=np.array([False]), acting=np.array([False]), alpha=0.05)
+        far=np.array([False]), acting=np.array([False]), curved=np.array([False]), alpha=0.05)
     found = SimpleNamespace(best=(0,), theta=true, unsteady={}, spectra=[
         linear_flight(np.random.default_rng(4), true, keys=1)])
     engine._constancy(found, {})
     assert found.unsteady[0] < 0        # one value in each group of bands explains no more
+
+
+@pytest.mark.parametrize(('change', 'constant'), [(0.2, True), (-1.5, False)])
+def test_the_value_of_a_start_that_acts_may_have_an_error_of_form(change, constant):
+    engine, count, slopes = object.__new__(Engine), 16000, np.random.default_rng(5).normal(
+        size=(16000, 2, 2))
+    vars(engine).update(
+        names=['start', 'tangent'], entries=[Entry('play', ('start', 'tangent'))],
+        index={'start': 0, 'tangent': 1}, known=2, narrow=np.full(2, 1e-3), late={},
+        typical=np.array([1.0, 0.3]), flight=np.zeros(2),
+        bounds=np.full((2, 2), [-np.inf, np.inf]),
+        kept=np.zeros(2, dtype=bool), owner=np.zeros(2, dtype=int), far=np.zeros(2, dtype=bool),
+        acting=np.array([True, False]), curved=np.ones(2, dtype=bool), alpha=0.05)
+    slow = np.fft.rfft(slopes[..., 1], axis=0)
+    slow[np.fft.rfftfreq(count, 0.01) > 2.0] = 0.0
+    # the value is another by this share above 2 Hz
+    effect = slopes[..., 0] + change * (slopes[..., 1] - np.fft.irfft(slow, axis=0))
+    noise = 0.3 * np.random.default_rng(6).normal(size=effect.shape)
+    found = spectrum(noise - effect, slopes, np.ones(effect.shape, dtype=bool), 0.01,
+                     np.full(2, 1e-6), np.inf, [np.arange(2)])
+    found.noise[:] = 0.09 * np.eye(2)
+    solution = SimpleNamespace(best=(0,), theta=np.array([1.0, 0.0]), unsteady={},
+                               spectra=[found])
+    engine._constancy(solution, {})
+    assert (solution.unsteady[0] < 0) == constant
 
 
 def test_bounds_of_keys_that_are_nearly_the_same_leave_a_finite_evidence():
@@ -108,6 +133,16 @@ def test_bounds_of_keys_that_are_nearly_the_same_leave_a_finite_evidence():
         prior, estimate = 10**rng.uniform(-1, 3, 3), slope[:, 0] - rng.uniform(0, 10)
         value, mean, covariance = judge._bounded(np.arange(3), estimate, wide, prior, own)
         assert np.isfinite([value, *mean, *covariance.ravel()]).all()
+
+
+def test_noise_that_rounding_makes_negative_does_not_widen_what_is_known():
+    found, never = normal([linear_flight(np.random.default_rng(6), np.zeros(2), keys=2)],
+                          ['a', 'b'], np.zeros(2)), np.zeros(2, dtype=bool)
+    found.noise[1] = found.noise[:, 1] = 0.0
+    found.noise[1, 1] = -1e-14
+    judge = Judge(found, np.full(2, 0.001), np.full(2, 0.02), np.full((2, 2), [-np.inf, np.inf]),
+                  never, np.arange(2), 0.05, never, np.zeros(2))
+    assert judge.posterior((0, 1)).covariance.diagonal() == pytest.approx([0.0, 0.0], abs=0.02**2)
 
 
 @pytest.mark.parametrize('unit', [1e-6, 1e6])

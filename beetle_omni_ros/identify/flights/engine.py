@@ -224,8 +224,11 @@ class Engine(Linearised):
                 continue
             split, keys, copies, count = self._split(
                 solution.spectra, banned, self.narrow[self.known:], k)
-            size = np.maximum(self.typical[keys], np.abs(solution.theta[keys]))
-            form = np.maximum(self.narrow[keys], FORM * np.abs(solution.theta[keys]))
+            value = np.abs(solution.theta[keys])
+            if self.curved[keys[0]]:    # tangents are deviations from the value, the start's
+                value[:count] = value[0]
+            size = np.maximum(self.typical[keys], value)
+            form = np.maximum(self.narrow[keys], FORM * value)
             form[count:] = self.typical[keys[count:]]
             judge = self._judge(split, np.hypot(self.narrow, self.typical * 9), named,
                                 np.tile(form, copies), np.tile(size, copies))

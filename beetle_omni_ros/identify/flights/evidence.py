@@ -27,7 +27,7 @@ from beetle_omni_ros.identify.inference.noise import few_blocks, positive, withi
 SCALES = 1.0, 3.0, 9.0  # times typical: the prior of a candidate is a mixture of these
 MIXED = log(len(SCALES))    # its price
 EXACT = 1e-3            # deviation of a factor that is one
-ROUNDING = 1e-12        # share of a prior's variance: a bound may leave less of a nearly equal key
+ROUNDING = 1e-12        # share of a variance or of information below which it is lost in rounding
 
 
 @dataclass(eq=False)
@@ -289,7 +289,8 @@ class Judge:
         """
         scatter = scores.T @ scores * self.blocks / max(self.blocks - 1, 1)
         noise = direction.T @ self.equations.noise @ direction
-        root, less, _ = positive(noise, np.maximum(np.diag(noise), 1e-300)**-0.5)
+        root, less, _ = positive(noise, np.maximum(
+            np.diag(noise), ROUNDING * np.diag(info))**-0.5)
         ratio, axes = np.linalg.eigh(less @ scatter @ less.T)
         more = root @ (axes * (self.student * np.maximum(ratio, 1.0) - 1.0) @ axes.T) @ root.T
         inverse = np.linalg.inv(info)
