@@ -195,7 +195,8 @@ class Linearised:
             balanced: list[int] = []
             if not flight.turning:      # what the model lacks is more than the noise
                 bands = {kind: bands.get(kind, []) for kind in flight.fed_back}
-                balanced, bands['torque'] = self._balanced(each, rest, bands['torque'])
+                if 'force' not in bands:
+                    balanced, bands['torque'] = self._balanced(each, rest, bands['torque'])
             elif len(bands[flight.turning]) < len(DYNAMIC):
                 bands |= dict.fromkeys(('force', 'torque', 'joint'), [])
             if flight.turning:      # its answer biases gains by less than servos differ
