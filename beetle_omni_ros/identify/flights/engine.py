@@ -15,7 +15,6 @@ from beetle_omni_ros.identify.flights.spectrum import EDGES, Spectrum
 ROUNDS, MOST_ROUNDS = 3, 6      # linearisations of a given set; of one that is searched at most
 STAYS = 0.25            # of its standard deviation: a smaller step of a value changes no interval
 NEAR_START = 0.1        # share of a start within which an effect without a slope is nearly linear
-ROUNDING = 1e-3         # [nat] less is no difference
 MOST = 8                # entries of a set
 PAIRED = 20             # entries whose pairs are all weighed; others follow from the best set
 
@@ -217,8 +216,7 @@ class Engine(Linearised):
         """
         Gain [nat] of one value for each group of bands over one value, of each named entry.
 
-        One value admits the error of the entry's form in each group of bands. It is that of the
-        group which knows the entry best, so that one group alone gains nothing.
+        One value admits the error of the entry's form in each group of bands.
         """
         named = self.indices(solution.best)
         for k in solution.best:
@@ -234,10 +232,8 @@ class Engine(Linearised):
             form[count:] = self.typical[keys[count:]]
             judge = self._judge(split, np.hypot(self.narrow, self.typical * 9), named,
                                 np.tile(form, copies), np.tile(size, copies))
-            own = self.known + np.arange(copies)[:, None] * len(keys) + np.arange(count)
-            best = (np.diag(split.info)[own] * size[:count]**2).sum(axis=1).argmax()
-            gain = judge.posterior(np.delete(own, best, axis=0).ravel()).gain
-            solution.unsteady[k] = gain if abs(gain) > ROUNDING else 0.0
+            own = self.known + (np.arange(copies)[:, None] * len(keys) + np.arange(count)).ravel()
+            solution.unsteady[k] = judge.posterior(own).gain
 
     def _judge(self, equations, wide=None, named=(), form=(), size=()):
         """Judge of all known keys, and of deviations of bands with priors ``form``, ``size``."""
