@@ -58,7 +58,7 @@ class BagFlight:
         mask: (M, 16) samples that count.
         rows: (M,) rows of the grid of the signals.
         time: (M,) times of the samples [s].
-        starts: name of a start -> deviations of the keys of its effect from where it begins.
+        starts: name of a start -> deviations of the keys of its effect.
         tangents: name of a tangent -> start and key.
 
     """
@@ -283,7 +283,7 @@ class BagFlight:
         return self._started(theta, own), own
 
     def _started(self, theta, own):
-        return {**theta, **{key: theta.get(key, 0.0) + self.keys[key].begins + factor * part
+        return {**theta, **{key: theta.get(key, 0.0) + factor * part
                             for name, factor in own.items()
                             for key, part in self.starts[name].items()}}
 
@@ -316,7 +316,7 @@ class BagFlight:
             also, member = of_start(other)
             if also == effect and (member == joint or None in (member, joint)):
                 for key, part in self.starts[other].items():
-                    without[key] -= self.keys[key].begins + factor * part
+                    without[key] -= factor * part
         without = {key: value for key, value in without.items() if abs(value) > 1e-12}
         return without, theta if name in own else self._started(without, {name: 1.0})
 

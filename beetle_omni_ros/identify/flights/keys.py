@@ -74,7 +74,6 @@ class Key:
         step: step of finite differences.
         form: whether it selects a form and is not fitted.
         ends_at_none: whether the smallest value means no effect, as of drag or friction.
-        begins: deviation from which a limit acts in the flights at all.
 
     """
 
@@ -91,7 +90,6 @@ class Key:
     step: float = 1e-3
     form: bool = False
     ends_at_none: bool = False
-    begins: float = 0.0
 
     def value(self, deviation: float) -> float:
         """Catalogue value of a deviation."""

@@ -279,7 +279,6 @@ class Linearised:
     def _left(self, k, theta, found):
         """Whitened power of flight k at ``theta`` (K,), with the noise that was ``found``."""
         values = dict(zip(self.names, self._at(k, theta), strict=False))
-        self.flights[k].settle(values)
         rest = self.transformed(k, self.flights[k].linear(values, []).residual)
         rest.noise = found.noise
         return rest.power()

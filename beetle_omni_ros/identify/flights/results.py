@@ -248,7 +248,7 @@ def parameters(entry: Entry, engine: Engine, index: list[int], posterior: Poster
         values, spans = [], []
         for name in own:
             key, row = of_key[name], rows[name]
-            middle = key.begins + float(row @ posterior.estimate)
+            middle = float(row @ posterior.estimate)
             form = FORM_DEVIATION * middle if law and not key.relative else 0.0
             half = 1.96 * float(row @ posterior.covariance @ row + form**2)**0.5
             values.append(key.value(middle))
@@ -319,8 +319,7 @@ def seen_from(engine: Engine, solution: Solution, keys: dict[str, Key], entry: E
         return {'value': size * part if known else None, 'unit': unit,
                 'typical': key.typical if name in starts else part}
     if name in starts:
-        return {'value': key.value(key.begins + part) if known else None, 'unit': unit,
-                'typical': None}
+        return {'value': key.value(part) if known else None, 'unit': unit, 'typical': None}
     return {'value': 100 * float(np.expm1(size * part)) if known else None, 'unit': '%',
             'typical': 100 * float(np.expm1(part))}
 

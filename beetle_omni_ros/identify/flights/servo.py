@@ -210,34 +210,30 @@ def _felt(signals, theta, place):
     return force + np.cross(turning, place) + np.cross(rate, np.cross(rate, place))
 
 
-def starts_of(key: Key, models: Sequence) -> tuple[float, tuple[tuple[float, ...], ...]]:
+def starts_of(key: Key, models: Sequence) -> tuple[tuple[float, ...], ...]:
     """
-    Deviation from which an effect acts in these flights, and its starts as deviations from there.
+    Starts of an effect without a slope; of a limit, where it begins to act in these flights.
 
-    A limit acts below the largest requested motion. Above, no value has an effect, so that what
-    a start explains does not shrink in proportion to the deviation from the robot file.
     ``models`` are of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`.
     """
     treatment = TREATMENTS[key.effect]
     if treatment.limit is None:
-        return 0.0, treatment.starts
+        return treatment.starts
     what, below = treatment.limit
-    found = {'tilt_rate': lambda m: np.fmin([np.abs(m.signals.joints({})[1]).max(), np.inf],
-                                            np.abs(_requested(m)[1]).max()),
-             'torque': lambda m: np.quantile(np.abs(_requested(m)[0]), (0.999, 1.0)),
-             'thrust': lambda m: np.quantile(m.flight.values[COMMAND][:, 4:], (0.999, 1.0))}[what]
-    most, largest = np.max([found(m) for m in models], axis=0)
-    begins = min(float(np.log(largest / key.base)), 0.0)
-    return begins, tuple((float(np.log(part * most / key.base)) - begins,)
-                         for part, in treatment.starts
-                         if part * most < min(below * key.base, largest))
+    most = max(float({
+        'tilt_rate': lambda m: np.abs(m.signals.joints({})[1]).max(),
+        'torque': lambda m: np.quantile(np.abs(_torques(m)), 0.999),
+        'thrust': lambda m: np.quantile(m.flight.values[COMMAND][:, 4:], 0.999)}[what](m))
+        for m in models)
+    return tuple((float(np.log(part * most / key.base)),) for part, in treatment.starts
+                 if part * most < below * key.base)
 
 
-def _requested(model):
+def _torques(model):
     """
-    Torques [N m] and rates [rad/s] that simulated servos request, without limits and noise.
+    Torques [N m] that the simulated servo loops request, without limits and encoder noise.
 
-    Torques include damping, which takes most of the stiffness term while a servo turns.
+    They include damping, which takes most of the stiffness term while a servo turns.
     """
     s, joint = model.signals, model.robot.joints
     run = model._servos([{}], {})[0]
@@ -245,4 +241,4 @@ def _requested(model):
     times = s.t[model._starts][:, None] + model.p.grid * np.arange(run.shape[1])
     edges = np.append(times.ravel(), times[-1, -1] + model.p.grid)
     target = s.tilt_targets(edges, s.delays({})[0]).reshape(run.shape)
-    return Servo.of(joint, effort_limit=None).motor(NUMPY, target - run, rate), rate
+    return Servo.of(joint, effort_limit=None).motor(NUMPY, target - run, rate)

@@ -215,9 +215,10 @@ class Signals:
     def _fused_tilts(self, model_tilts, raw, gap):
         """Angle, rate, acceleration (N, 4): slow part from encoders, fast part from the model."""
         p, derivatives_of_model = self.p, self._model_derivatives
+        if gap.any():
+            model_tilts = play(model_tilts, gap / 2)
+            derivatives_of_model = derivatives(model_tilts, p.smooth_joint, p.grid)
         slow = [within(low_pass(p.guide_edge, 1, p.grid), raw - model_tilts, 0)]
-        if gap.any():       # behind the encoders, in slow motion as well
-            derivatives_of_model = derivatives(play(model_tilts, gap / 2), p.smooth_joint, p.grid)
         for _ in range(2):
             slow.append(np.gradient(slow[-1], p.grid, axis=0))
         return tuple(a + b for a, b in zip(derivatives_of_model, slow, strict=True))

@@ -161,18 +161,12 @@ def first_point(models, every, robot):
 
 
 def starts_in(keys: dict[str, Key], models: Sequence[BagFlight]) -> Starts:
-    """
-    Name of a start -> deviations of the keys of its effect, of all joints or of one.
-
-    They count from where the effect begins to act, which ``keys`` then have.
-    """
+    """Name of a start -> deviations of the keys of its effect, of all joints or of one."""
     result = {}
     for name in LIMITS:
         own = [key for key in keys.values() if key.effect == name and not key.form]
         single = range(4) if own[0].parameter in OF_ONE else ()
-        begins, starts = starts_of(own[0], models)
-        keys |= {key.name: replace(key, begins=begins) for key in own}
-        for k, start in enumerate(starts):
+        for k, start in enumerate(starts_of(own[0], models)):
             result[f'{name}@{k}'] = dict(zip([key.name for key in own], start, strict=True))
             result |= {f'{name}[{j + 1}]@{k}': {
                 f'servo.{key.parameter}[{j}]': value
