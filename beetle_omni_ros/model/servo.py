@@ -107,11 +107,13 @@ class Step:
             push = _within(space, push, self._per_torque * servo.effort_limit)
         after = rate + push
         if load is not None:
+            if servo.velocity_limit is not None:    # of the motor; a load may drive it faster
+                after = _within(space, after, servo.velocity_limit)
             after = after + self._per_torque * load
         if servo.coulomb is not None:
             after = after - _within(
                 space, after, self._slides + self._sticks * servo.fading(space, rate))
-        if servo.velocity_limit is not None:    # the motor also holds the load there
+        if load is None and servo.velocity_limit is not None:
             after = _within(space, after, servo.velocity_limit)
         return after
 

@@ -176,10 +176,9 @@ class Plant:
             # Torques on the joints at the end of the last tick, but for motor and friction.
             others = self._robot.joints.inertia * data.qacc[6:] - data.actuator_force[4:] \
                 - self._friction
-            held = -self._friction if touching else others      # forces of contacts are no load
             for _ in range(substeps):
                 if not fast:
-                    self._limit_rates(held + self._friction)
+                    self._limit_rates()
                 if self._has_friction:
                     self._rub(others)
                 mujoco.mj_step(model, data)
@@ -192,7 +191,7 @@ class Plant:
         else:
             # The acceleration must also use the limited torque: the full one would give
             # thousands of rad/s^2 at the rate limit.
-            self._limit_rates(held + self._friction)
+            self._limit_rates()
             self._update()
             effort = self._robot.joints.effort_limit
             model.actuator_forcerange[4:] = (-effort, effort)
@@ -213,14 +212,14 @@ class Plant:
                 fast = False
         return touching, fast
 
-    def _limit_rates(self, load):
-        """Limit each servo's torque so that its joint with a load keeps the rate limit."""
+    def _limit_rates(self):
+        """Limit each servo's torque so that its joint does not exceed the rate limit."""
         joints, rate = self._robot.joints, self._rate
         gain = joints.inertia / self.model.opt.timestep
         limits = self.model.actuator_forcerange
         effort, rate_limit = joints.effort_limit, joints.velocity_limit
-        limits[4:, 0] = clipped(gain * (-rate_limit - rate) - load, -effort, effort)
-        limits[4:, 1] = clipped(gain * (rate_limit - rate) - load, -effort, effort)
+        limits[4:, 0] = clipped(gain * (-rate_limit - rate), -effort, effort)
+        limits[4:, 1] = clipped(gain * (rate_limit - rate), -effort, effort)
 
     def _apply_forces(self, ahead=0.0):
         """Apply the external wrench and the effects' forces, predicted ``ahead`` [s] from now."""

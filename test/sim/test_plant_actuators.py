@@ -1,9 +1,6 @@
 """Servos and rotors of the plant have the response of their parameters."""
 
-from dataclasses import replace
-
 import numpy as np
-import pytest
 from sim_robots import immovable, plant, ROBOT
 
 JOINT = ROBOT.joints
@@ -33,25 +30,20 @@ def test_servo_sags_by_load_over_stiffness():
     assert np.all(np.pi / 2 - tilt > 0.05)
 
 
-@pytest.mark.parametrize(('acceleration', 'friction'), [(0.0, 0.0), (20.0, 0.0), (0.0, 0.02)])
-def test_tilt_rate_stays_at_its_limit(acceleration, friction):
-    rubbing = {'joint_friction': {'coulomb': friction, 'stiction': friction}} if friction else {}
-    made = plant(replace(immovable(), effects=rubbing))
+def test_tilt_rate_stays_at_its_limit():
+    made = plant(immovable())
     made.set_targets(np.array([3.0, -3.0, 2.0, 1.5]), np.zeros(4))
     fastest, positions = 0.0, []
     for _ in range(60):
-        made.wrench[2] = 190 * acceleration     # loads the servos with their modules
         made.step()
         fastest = np.maximum(fastest, np.abs(made.state[1][6:]))
         positions.append(made.state[0][7])
-    np.testing.assert_allclose(fastest, JOINT.velocity_limit, rtol=3e-3)
+    np.testing.assert_allclose(fastest, JOINT.velocity_limit, rtol=1e-3)
     cruise = np.diff(positions[10:40]) / TICK
-    np.testing.assert_allclose(cruise, JOINT.velocity_limit, rtol=3e-3)
-    made.wrench[2] = 0.0
+    np.testing.assert_allclose(cruise, JOINT.velocity_limit, rtol=1e-3)
     for _ in range(100):
         made.step()
-    np.testing.assert_allclose(made.state[0][7:], [3.0, -3.0, 2.0, 1.5],
-                               atol=1e-3 + friction / JOINT.kp)
+    np.testing.assert_allclose(made.state[0][7:], [3.0, -3.0, 2.0, 1.5], atol=1e-3)
 
 
 def test_thrust_follows_first_order_lag_up_and_down():
