@@ -236,9 +236,10 @@ class Linearised:
         self.acting, self.point = self.curved & (theta[:self.known] == 1), theta
         spectra = made or self._spectra(theta, etas)
         other = [k for k, name in enumerate(self.names[:self.known]) if name != BY_MOTION]
-        for each, still, balanced in zip(spectra, self.still, self.balanced, strict=True):
+        for each, still, balanced, eta in zip(
+                spectra, self.still, self.balanced, etas, strict=True):
             each.hidden = still
-            each.forget(other, balanced)
+            each.forget(other, balanced, theta + eta)
         self.narrow[self.known:] = self.start[self.known:]
         for each, last in zip(spectra, before, strict=True):
             each.noise = last.noise

@@ -212,7 +212,7 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
         root = np.linalg.inv(np.linalg.cholesky(found.noise[-1][np.ix_(own, own)]))
         a = np.zeros((*small.residual.shape[:2], len(own), effect.shape[2]))
         a[..., small.parts[0][1]] = small.parts[0][2]
-        for band, lost in found.hidden:
+        for band, lost in (*found.hidden, *found.balanced):
             a[:, np.flatnonzero(small.band == band)[:, None], np.isin(own, lost)] = 0.0
         a = (root @ a[:, :count]).reshape(len(rest), -1, effect.shape[2])
         b = (rest[:, :count][..., own] @ root.T).reshape(len(rest), -1, 1)
@@ -306,10 +306,11 @@ def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
     The tests; the most improbable first.
 
     Where an entry is excluded, or noise hides the motion, the controller feeds noise back, and
-    what repeats may be its answer; nothing is tested there.
+    what repeats may be its answer; nothing is tested there. Nor is it where commands balance
+    torques, because most entries have no slope there.
     """
     own = [c for c in solution.spectra[0].parts[0][0]
-           if engine.channels[c].split('_')[0] not in engine.without_motion()]
+           if engine.channels[c].split('_')[0] not in engine.without_motion(engine.balanced)]
     if solution.banned or not own:
         return []
     left = [found.at(fitted(engine, solution, k)) for k, found in enumerate(solution.spectra)]

@@ -60,6 +60,7 @@ class Spectrum:
         step: between frequencies, the first of which is zero [Hz].
         level: whether all bands have the same noise.
         hidden: bands and channels that do not count, because noise hides the motion.
+        balanced: bands and channels in which most keys have no slope; see :meth:`forget`.
 
     """
 
@@ -73,6 +74,7 @@ class Spectrum:
     step: float
     level: bool = False
     hidden: Sequence[tuple[int, list[int]]] = ()
+    balanced: Sequence[tuple[int, list[int]]] = ()
 
     def at(self, x: np.ndarray) -> np.ndarray:
         """(B, F, C) coefficients of the residual at deviations ``x`` (K,)."""
@@ -88,12 +90,14 @@ class Spectrum:
             result[..., channels] = slopes[..., keys == key].sum(axis=3)
         return result
 
-    def forget(self, keys: list[int], bands: list[tuple[int, list[int]]]) -> None:
-        """Let these keys have no slope in some bands and channels."""
+    def forget(self, keys: list[int], bands: list[tuple[int, list[int]]], at: np.ndarray) -> None:
+        """Hold these keys at their values in ``at`` (K,), in some bands and channels."""
+        self.balanced = bands
         for channels, own, slopes in self.parts:
             for band, lost in bands:
                 rows = np.flatnonzero(self.band[:slopes.shape[1]] == band)
                 gone = np.isin(channels, lost)[:, None] & np.isin(own, keys)
+                self.residual[:, rows[:, None], channels] += (slopes[:, rows] * gone) @ at[own]
                 slopes[:, rows] *= ~gone
 
     def joined(self, copies: list[tuple[int, int, list[int]]], other: Spectrum, count: int
