@@ -4,6 +4,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.flights.keys import base_of, names_of, OF_ONE, THRUST_BUS, TILT_BUS
@@ -16,7 +17,6 @@ from beetle_omni_ros.identify.recording.series import (
     EDGE,
     held_at,
     integral,
-    lagged,
     low_pass,
     matrices,
     spread,
@@ -250,7 +250,11 @@ class Signals:
                                 lambda: self._mean_commands(delay, limit))
             tau = self.robot.rotors.time_constant * np.exp(lag + np.array(own))
             places = np.rint((self.t - self._begin) / self._step).astype(int) - 1
-            force = lagged(mean, np.exp(-self._step / tau))[places]
+            keep = np.exp(-self._step / tau)
+            lagged = np.stack([lfilter([1 - k], [1, -k], column, zi=k * column[:1])[0]
+                               for k, column in zip(keep, mean.T, strict=True)], axis=1)
+            places = np.rint((self.t - self._begin) / self._step).astype(int) - 1
+            force = lagged[places]
             return force, (mean[places + 1] - force) / tau
         return self._cached(('thrust', delay), theta, LAGS, make)
 

@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import dct
-
-from beetle_omni_ros.identify.recording.series import filtered
+from scipy.signal import fftconvolve
 
 BLOCK = 8.0         # [s] of a block: longer than the memory of a flight controller
 # [Hz] of the bands; the first is the mean alone
@@ -295,7 +294,7 @@ def _whitened(series, there, kernel):
     left, right = there[left], there[right]
     part = np.clip((t - left) / np.maximum(right - left, 1), 0, 1)
     series = series[left] + part[:, None] * (series[right] - series[left])
-    return filtered(kernel, series)
+    return fftconvolve(series, kernel[:, None], axes=0)[:len(t)]
 
 
 def whitening(power: np.ndarray, period: float) -> np.ndarray:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.flights.body import BodyModel
@@ -26,7 +27,6 @@ from beetle_omni_ros.identify.recording.series import (
     derivatives,
     FASTEST,
     filled,
-    lagged,
     rising,
     slow,
     turning,
@@ -242,9 +242,9 @@ class TableFlight:
             command = np.stack([np.interp(t - delay, t, c) for c in command.T], axis=1)
         keep, ramp = np.exp(-h / tau), (1 - np.exp(-h / tau)) * tau / h
         # exact for commands that are linear between samples; begins settled
-        force = lagged(command - (ramp - keep) / (1 - keep) * np.diff(
-            command, axis=0, prepend=command[:1]), keep)
-        return force, (command - force) / tau
+        lagged = lfilter([1 - ramp, ramp - keep], [1, -keep], command, axis=0,
+                         zi=ramp * command[:1])[0]
+        return lagged, (command - lagged) / tau
 
     @property
     def usable(self) -> bool:

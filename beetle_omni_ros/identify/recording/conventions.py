@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import wilcoxon
 
 from beetle_omni_ros.identify.recording.series import (
     aligned,
@@ -38,7 +39,6 @@ def read_tables(paths: Sequence[Path], form: Format) -> list[Table]:
         LogError, ParameterError: unusable file; key of the format, its value and the expected one.
 
     """
-    from scipy.stats import wilcoxon  # takes half a second
     columns = [columns_of(path, form) for path in paths]
     tables = [table_of(path, own, form) for path, own in zip(paths, columns, strict=True)]
     if not tables or not set(READINGS) <= set(form.signals):

@@ -12,11 +12,12 @@ from itertools import permutations, product
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.recording.bag import COMMAND, IMU, JOINTS, POSE, Recording
 from beetle_omni_ros.identify.recording.parameters import shipped
-from beetle_omni_ros.identify.recording.series import aligned, lagged, low_pass, matrices
+from beetle_omni_ros.identify.recording.series import aligned, low_pass, matrices
 from beetle_omni_ros.model.parameters import RobotParameters
 
 GRAVITY = 'gravity'     # [m/s^2] that the accelerometer measures
@@ -112,7 +113,8 @@ def signals_of(recording: Recording, robot: RobotParameters) -> Smoothed | None:
         even = np.stack([np.interp(grid, t, column) for column in values.T], axis=1)
         if topic == COMMAND:
             keep = np.exp(-kernel.period / robot.rotors.time_constant)
-            even[:, 4:] = lagged(even[:, 4:], keep)
+            even[:, 4:] = lfilter([1 - keep], [1, -keep], even[:, 4:], axis=0,
+                                  zi=keep * even[:1, 4:])[0]
         data[topic] = np.stack([kernel(even, order)[:len(at)] for order in range(3)])
         for k in np.flatnonzero(np.diff(t) > limits.period[1]):
             silent |= (at > t[k]) & (at < t[k + 1])

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.fft import dct, idct, irfft, next_fast_len, rfft
+from scipy.fft import dct, idct
+from scipy.signal import fftconvolve, firwin
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.model import rotations
@@ -18,7 +19,6 @@ WINDOW = 2.0        # [s] in which one shift of two clocks is measured
 REACH = 0.15        # [s] largest shift
 FASTEST = 8.0       # [Hz] of MoCap, whose noise grows with the square of frequency
 LEAST = 3           # windows of which the scatter can be known
-LOST = 1e-17        # share of a deviation that rounding hides
 STENCILS = (1.0,), (0.5, 0.0, -0.5), (1.0, -2.0, 1.0)     # of derivatives
 
 
@@ -46,7 +46,8 @@ class LowPass:
     def __call__(self, x: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Filtered x (N, ...), or its derivative of order 1 or 2, at ``centres(N)``: (M, ...)."""
         taps = np.convolve(self.taps, STENCILS[derivative], 'same') / self.period**derivative
-        return filtered(taps, x)[len(taps) - 1::self.every]
+        kernel = taps.reshape(-1, *(x.ndim - 1) * (1,))
+        return fftconvolve(x, kernel, axes=0)[len(taps) - 1:len(x):self.every]
 
     def centres(self, count: int) -> np.ndarray:
         """Indices of the output samples for ``count`` input samples."""
@@ -62,26 +63,7 @@ def low_pass(edge: float, every: int, period: float) -> LowPass:
     step = every * (1 if every % 2 == 0 else 2)
     count = step * max(1, round(length / step)) + 1
     # The end taps of a Hann window are zero, so derivatives of the taps are complete.
-    taps = np.hanning(count) * np.sinc(2 * edge * period * (np.arange(count) - count // 2))
-    return LowPass(taps / taps.sum(), every, period)
-
-
-def filtered(taps, x):
-    """Series x (N, ...) filtered by ``taps`` (L, ...), zero before its first sample."""
-    size = next_fast_len(len(x) + len(taps) - 1, real=True)
-    taps = taps.reshape(len(taps), *(taps.shape[1:] or (1,) * (x.ndim - 1)))
-    return irfft(rfft(x, size, axis=0) * rfft(taps, size, axis=0), size, axis=0)[:len(x)]
-
-
-def lagged(x, keep):
-    """Series x (N, n) behind a lag that leaves ``keep`` of a deviation a step; begins settled."""
-    keep, span = np.reshape(keep, (-1, 1)), 1
-    y = (1 - keep) * np.ascontiguousarray(x.T)
-    y[:, 0] = x[0]
-    while span < len(x) and keep.max() > LOST:      # sums of 1, 2, 4, ... terms
-        y[:, span:] += keep * y[:, :-span]
-        keep, span = keep**2, 2 * span
-    return y.T
+    return LowPass(firwin(count, edge, window='hann', fs=1 / period), every, period)
 
 
 def matrices(q):
