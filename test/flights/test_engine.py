@@ -377,7 +377,7 @@ def test_duty_needs_a_robot_with_a_motor_map(tmp_path):
 @pytest.mark.timeout(600)
 def test_real_flights_name_thrust_and_drag_and_never_an_inertia():
     result = gap_of(sorted(REAL.glob('*_fast.csv.gz')))
-    assert {'thrust_coefficient', 'rotor_drag'} <= named(result)
+    assert {'thrust_coefficient', 'rotor_drag', 'rotor_hub_moment'} <= named(result)
     assert not {'inertia', 'torque_coefficient', 'wind'} & named(result)
     assert result['groups']['acceleration']['used'] and result['groups']['rate']['used']
     found = {effect['names'][0]: effect['parameters'] for effect in result['effects']}

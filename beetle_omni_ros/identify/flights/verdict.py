@@ -66,6 +66,7 @@ TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coef
            'propeller_gyroscopic_torque', 'rotor_acceleration_torque')
 FEEDBACK = ('the commands explain too little of the angular acceleration: a controller that feeds '
             'back what the model lacks would be taken for the robot')
+BALANCED = 'they show the hub moment alone, which the commands balance'
 WEIGHED = 'mass', 'inertia'
 LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
 IMU = 'imu_accelerometer_bias', 'imu_misalignment', 'imu_lever_arm'
@@ -283,6 +284,8 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
             for flight in [*usable, *judging]:
                 flight.without(('torque',), FEEDBACK)
             groups = _groups(usable[0], declared)
+        else:
+            groups['torque']['reason'] = BALANCED
         engine, keys = _engine(usable, robot, p, declared, alpha, (HUB,))
         solution = engine.run()
     judges = [flight for flight in judging if flight.usable] or usable
