@@ -34,8 +34,8 @@ def fly(controller: options.ControllerOption = DEFAULT,
         clock: Annotated[str, Option(
             callback=options.one_of, metavar='auto|system|simulated', help=(
             'system: real time; simulated: simulated time on /clock, which waits for late nodes, '
-            'with direct actuators; auto: simulated if this computer is too slow for real time, '
-            'measured before the start.'))] = 'auto',
+            'with direct actuators; auto: real time, and again in simulated time if this computer '
+            'was too slow.'))] = 'auto',
         robot: options.RobotOption = None,
         plant: options.PlantOption = None,
         nmpc: options.NmpcOption = None,

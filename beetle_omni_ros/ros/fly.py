@@ -1,49 +1,43 @@
 """`beetle_omni fly`: fly the ROS graph, record a bag, and print the results from the bag."""
 
 from collections.abc import Callable
-from contextlib import contextmanager, ExitStack, suppress
+from contextlib import contextmanager, ExitStack
 from functools import partial
 import json
-import os
 from pathlib import Path
-from statistics import median
 import subprocess
 import sys
 import tempfile
-import time
 
 from rich.console import Console
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.bags.bag_writer import check_new, set_meta
-from beetle_omni_ros.bags.log import motion, Recorder
+from beetle_omni_ros.bags.log import motion
 from beetle_omni_ros.bags.metrics import failed, metrics
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.control.tasks import make_task, Task
-from beetle_omni_ros.flight.component import ERROR, made
-from beetle_omni_ros.flight.loop import ARMING_TIME, collector_off, FlightLoop
+from beetle_omni_ros.flight.component import ERROR
+from beetle_omni_ros.flight.loop import ARMING_TIME
 from beetle_omni_ros.model.files import write_json, write_text
+from beetle_omni_ros.model.mode import FALLBACK
 from beetle_omni_ros.model.parameters import find_robot, RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 from beetle_omni_ros.ros import runner
-from beetle_omni_ros.ros.clients import NEVER, Operator
+from beetle_omni_ros.ros.clients import NEVER, Operator, SUPERVISOR
 from beetle_omni_ros.ros.graph import (
     BRIDGES,
     child_environment,
     COMPOSED,
-    CONTROLLER,
     Graph,
-    NODES,
-    Parameters,
     plan,
     reserved_domain,
 )
-from beetle_omni_ros.ros.runner import REAL_TIME_PRIORITY
 from beetle_omni_ros.show import table
 from beetle_omni_ros.show.page import print_end
 from beetle_omni_ros.sim.faults import DEVICES, load_faults
+from beetle_omni_ros.supervisor.inputs import TOO_SLOW
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
@@ -56,6 +50,10 @@ SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as
 # stop after so long without a command.
 SLOW_TIME = 0.1
 PACING = 'sim_node: pacing'
+SUPERVISOR_STATUS = f'{SUPERVISOR}: supervisor'
+LATE = 'stale stamp', 'estimates_late', 'commands_late'     # in the names of its values
+SLOW = 'this computer was too slow'
+ADVICE = 'try --clock simulated'
 FILM = 'flight.html'        # of --view, in the folder of the bag
 
 
@@ -84,8 +82,12 @@ def run_fly(*, bag: Path, controller: str = registry.DEFAULT, task: str = 'waypo
         flown_task = make_task(task, seed, registry.find(controller).reach(
             RobotParameters.load(robot)))
         injected = load_faults(faults) if faults else []
-        nodes, clock = _planned(console, folder, controller, task, bag, robot, plant, seed,
-                                injected, **more)
+        planned = partial(_planned, console, folder, controller, task, bag, robot, plant, seed,
+                          injected)
+        clock = more.pop('clock', 'auto')
+        choice = clock == 'auto' and more.get('actuators') != 'emulated' and not injected
+        clock = 'simulated' if clock == 'simulated' else 'system'
+        nodes = planned(clock=clock, **more)
         number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
         if view:
             stack.enter_context(viewer_process(number, console))
@@ -94,56 +96,48 @@ def run_fly(*, bag: Path, controller: str = registry.DEFAULT, task: str = 'waypo
         meta = {'task': task, 'conditions': nodes['sim_node']['conditions'], 'seed': seed,
                 'robot': str(robot) if robot else 'params/robot.yaml',
                 'plant': str(plant) if plant else None, 'version': __version__,
-                'controller': registry.find(controller).name, 'clock': clock,
-                'actuators': nodes['sim_node'].get('actuators', 'direct'),
+                'controller': registry.find(controller).name,
                 **({'faults': [str(fault) for fault in injected]} if injected else {})}
-        nodes['recorder_node']['meta'] = json.dumps({**meta, 'interrupted': True})  # to the end
-        graph = Graph(nodes, folder, number)
-        failure = slow = ''
-        try:
-            failure, slow = _fly(graph, meta['controller'], flown_task, console,
-                                 clock == 'simulated')
-        except KeyboardInterrupt:
-            meta['interrupted'] = True
-        return _conclude(graph, Path(bag), flown_task, meta, failure, slow, json_path, console,
-                         full, view)
+        while True:
+            meta['clock'] = clock
+            meta['actuators'] = nodes['sim_node'].get('actuators', 'direct')
+            # the recorder's meta is that of an interrupted flight until the end
+            nodes['recorder_node']['meta'] = json.dumps({**meta, 'interrupted': True})
+            graph = Graph(nodes, folder, number)
+            failure = slow = ''
+            try:
+                failure, slow = _fly(graph, meta['controller'], flown_task, console, clock, choice)
+            except KeyboardInterrupt:
+                meta['interrupted'] = True
+            if not (choice and slow and failure):
+                return _conclude(graph, Path(bag), flown_task, meta, failure, slow, json_path,
+                                 console, full, view)
+            _print(console, f'{slow}: flown again in simulated time', style='yellow')
+            if bag.exists():
+                late = bag.rename(bag.with_name(f'{bag.name}_late'))
+                _print(console, f'bag of the late flight: {late}')
+            choice, clock = False, 'simulated'
+            nodes = planned(clock=clock, **more)
 
 
-def _planned(console, folder, controller, task, bag, robot, plant, seed, faults, *,
+def _planned(console, folder, controller, task, bag, robot, plant, seed, faults, *, clock,
              nmpc=None, policy=None, standby=True, conditions='nominal', actuators=None,
-             clock='auto', components=()):
-    """Nodes of a flight with their parameters, and its clock."""
+             components=()):
+    """Nodes of a flight with their parameters."""
     RobotParameters.load(plant or robot)
-    planned = partial(
-        plan, controller, nmpc=_absolute(nmpc), policy=str(policy or ''), standby=standby,
+    nodes, left_out = plan(
+        controller, nmpc=_absolute(nmpc), policy=str(policy or ''), standby=standby,
         robot_file=_absolute(robot and find_robot(robot)),
         plant_file=_absolute(plant and find_robot(plant)), conditions=conditions, seed=int(seed),
         task=_absolute(task) if Path(task).is_file() else str(task), bag=_absolute(bag),
-        ports=str(folder), actuators=_checked(faults, actuators), components=components)
-    nodes, left_out = planned(clock='system' if clock == 'auto' else clock)
-    if clock == 'auto':
-        clock = _clock(nodes, robot, actuators, console)
-        nodes, left_out = planned(clock=clock)
+        ports=str(folder), actuators=_checked(faults, actuators), components=components,
+        clock=clock)
     nodes['sim_node']['task_faults'] = '; '.join(map(str, faults))
     if clock == 'simulated':    # it begins when all nodes are there
         nodes['sim_node']['pause_at'] = 0.0
     for name, reason in left_out.items():
         _print(console, f'{name} does not stand by: {reason}')
-    return nodes, clock
-
-
-def _clock(nodes, robot, actuators, console):
-    """Choose the clock of a flight by the pace of this computer, and say so in one line."""
-    with console.status('measuring the pace (the first time compiles the controller)'):
-        share, reason = too_slow(nodes, robot)
-    if not reason:
-        _print(console, f'real time: the flight needs {100 * share:.0f} % of a core')
-    elif actuators == 'emulated':
-        _print(console, f'{reason}; emulated devices have real time only', style='yellow')
-    else:
-        _print(console, f'{reason}; simulated time is used', style='yellow')
-        return 'simulated'
-    return 'system'
+    return nodes
 
 
 def _conclude(graph, bag, task, meta, failure, slow, json_path, console, full, film) -> int:
@@ -157,9 +151,9 @@ def _conclude(graph, bag, task, meta, failure, slow, json_path, console, full, f
         if 'interrupted' in meta:
             raise KeyboardInterrupt
         if failure:
-            _complain(failure + slow)
+            _complain('; '.join(filter(None, (failure, slow and f'{slow}: {ADVICE}'))))
         elif slow:
-            _print(console, slow.removeprefix('; '), style='yellow')
+            _print(console, f'{slow}: {ADVICE}', style='yellow')
     finally:
         page = bag / FILM
         print_end(console, [bag, log, *([page] if page.exists() else []), json_path],
@@ -207,15 +201,19 @@ def _complain(error):
     print(f'beetle_omni fly: error: {error}', file=sys.stderr)
 
 
-def _fly(graph: Graph, controller: str, task: Task, console: Console,
-         simulated: bool) -> tuple[str, str]:
-    """Fly, and return why the flight failed, or '', and :meth:`Flight.slow`."""
+def _fly(graph: Graph, controller: str, task: Task, console: Console, clock: str,
+         choice: bool) -> tuple[str, str]:
+    """
+    Fly, and return why the flight failed, or '', and :meth:`Flight.slow`.
+
+    With a ``choice`` of the clock, a flight on a computer that is too slow ends early.
+    """
     failure, flight = '', None
     try:
         graph.start()
         with console.status('starting') as status:
-            flight = Flight(graph, controller, task, status.update)
-            for part in (lambda: flight.fly(simulated), flight.land):
+            flight = Flight(graph, controller, task, status.update, choice)
+            for part in (lambda: flight.fly(clock == 'simulated'), flight.land):
                 try:
                     part()
                 except RunError as error:
@@ -237,9 +235,11 @@ def _fly(graph: Graph, controller: str, task: Task, console: Console,
 class Flight(Operator):
     """One flight of a started graph: arm, take off, fly the task, land."""
 
-    def __init__(self, graph: Graph, controller: str, task: Task, show: Callable[[str], None]):
+    def __init__(self, graph: Graph, controller: str, task: Task, show: Callable[[str], None],
+                 choice: bool = False):
         super().__init__(graph.domain, controller)
         self._graph, self._task, self.show, self._lands = graph, task, show, False
+        self._choice, self._answer = choice, ''     # of the supervisor to a request to arm
         self._lost_before = float('inf')    # s, of the simulator before the take-off
         self._paused = NEVER    # s, at which simulated time stands still
         self.required = [node for node in graph.nodes if node in BRIDGES]
@@ -265,8 +265,13 @@ class Flight(Operator):
     def slow(self) -> str:
         """Return a text if the computer was too slow, else ''."""
         late = self._lost_time() - self._lost_before
-        return '' if late < SLOW_TIME else f'; this computer was too slow, the simulator fell ' \
-            f'{late:.1f} s behind: try --clock simulated'
+        if late >= SLOW_TIME:
+            return f'{SLOW}, the simulator fell {late:.1f} s behind'
+        fell_back = any(mode.state == FALLBACK for mode in self.states)
+        if self._answer.endswith(TOO_SLOW) or fell_back and any(
+                sign in key for key in self.values(SUPERVISOR_STATUS) for sign in LATE):
+            return f'{SLOW}, its estimates or commands came late'
+        return ''
 
     def _lost_time(self):
         """Return the time that the simulator skipped because it was late [s]."""
@@ -274,11 +279,11 @@ class Flight(Operator):
 
     def arm(self) -> tuple[bool, str]:
         """Ask the supervisor to arm; simulated time stands still until it does."""
-        accepted, answer = super().arm()
+        accepted, self._answer = super().arm()
         if self._paused < NEVER:
             self._paused = NEVER if accepted else self._paused + TICK
             self.pause_at(self._paused)
-        return accepted, answer
+        return accepted, self._answer
 
     def _fly_task(self):
         name, start = self._task.name, self.time()
@@ -309,6 +314,8 @@ class Flight(Operator):
         super().spin(seconds)
         if self._lands:
             return
+        if self._choice and self.state.state == FALLBACK and (slow := self.slow()):
+            raise RunError(slow)
         if dead := self._graph.dead():
             raise RunError('; '.join(f'{name} died ({how})' for name, how in dead.items()))
         status = self.diagnostics.get(f'{self.controller}_node: controller')
@@ -333,59 +340,3 @@ def _report(bag, controller, task, meta, json_path, console, full, film) -> dict
         from beetle_omni_ros.show.recorded import recorded_scene  # viser takes a second
         write_text(bag / FILM, recorded_scene({controller: log}), 'film')
     return results[controller]
-
-
-# Time of the graph's process, in times of the loop: messages and callbacks in Python. Measured
-# by benchmarks/graph.py, see docs/results/ros_graph.md.
-GRAPH = 4.0
-MOST = 0.95         # of a core that the graph's process may need
-CORES = 2           # one for the graph, one for bridges, operator, viewer and browser
-WINDOW, WINDOWS = 0.25, 7   # [s] of simulated time; the median of the windows counts
-
-
-def too_slow(nodes: Parameters, robot: Path | None) -> tuple[float, str]:
-    """
-    Return the share of a core that a graph in real time needs, and why it is too much, or ''.
-
-    The controllers, the estimator, the supervisor and the simulator of ``nodes`` fly in the loop
-    for a moment, with the priority of the graph. A ParameterError reports an unusable controller.
-    """
-    share = GRAPH * _time_of_loop(_loop(nodes, RobotParameters.load(robot)))
-    cores = len(os.sched_getaffinity(0))
-    if cores < CORES:
-        return share, f'real time needs {CORES} cores, this computer has {cores}'
-    if share > MOST:
-        return share, ('this computer is too slow for real time: the flight needs '
-                       f'{100 * share:.0f} % of a core, expected at most {100 * MOST:.0f} %')
-    return share, ''
-
-
-def _loop(nodes, robot):
-    """The nodes' flight in one process."""
-    aboard, components = {}, []
-    for name, values in nodes.items():
-        if 'component' in values:
-            components.append(values['component'])
-        elif NODES.get(name, CONTROLLER) == CONTROLLER:
-            entry = registry.find(values.get('controller') or name.removesuffix('_node'))
-            aboard[entry.name] = entry.make(robot, ControllerOptions(
-                parameters=values.get(f'{entry.name}_file'), policy=values.get('policy')))
-    return FlightLoop(robot, robot, aboard, Recorder(), others=made(components, robot))
-
-
-def _time_of_loop(loop):
-    """Time of a simulated second in flight, at real-time priority if the system permits it."""
-    times, before = [], (os.sched_getscheduler(0), os.sched_getparam(0))
-    with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(REAL_TIME_PRIORITY))
-    try:
-        with collector_off():
-            with suppress(RunError):    # the graph reports it
-                loop.take_off()
-            for _ in range(WINDOWS):
-                begin = time.perf_counter()
-                loop.run(WINDOW)
-                times.append(time.perf_counter() - begin)
-    finally:
-        os.sched_setscheduler(0, *before)
-    return median(times) / WINDOW

@@ -23,6 +23,7 @@ from beetle_omni_ros.supervisor.way import inclination
 TICK_LIMIT = 0.02       # [s] a longer pause of the supervisor counts as this for the sources
 ESTIMATE_TIMEOUT = 0.05     # [s] 10 periods of 200 Hz
 STALE_AFTER = 0.05      # [s] older estimates are refused
+TOO_SLOW = 'the computer is too slow'   # end of a refusal to arm
 JOINT_TIMEOUT = ROTORS_TIMEOUT = 0.2    # [s]
 IMU_TIMEOUT = 0.05      # [s]
 MOCAP_TIMEOUT = 0.2     # [s]
@@ -289,7 +290,7 @@ class Inputs:
         if self.joints.silent:
             return f'no fresh joint angles (joint_bridge_node {self.joints.text})'
         if late := self.late(controller):
-            return f'{late[1]}: the computer is too slow'
+            return f'{late[1]}: {TOO_SLOW}'
         angle = np.degrees(inclination(state.quaternion))
         speed, rate = np.linalg.norm(state.velocity), np.linalg.norm(state.angular_velocity)
         if angle > np.degrees(ARM_TILT):

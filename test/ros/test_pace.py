@@ -1,7 +1,6 @@
-"""The pace of a computer, measured before a flight, and the clock that follows from it."""
+"""A flight in real time on a computer that is too slow is flown again in simulated time."""
 
 import os
-import time
 from types import SimpleNamespace
 
 import pytest
@@ -9,56 +8,65 @@ from synthetic_flights import fly
 
 from beetle_omni_ros.bags.bag import read_bag
 from beetle_omni_ros.bags.bag_writer import BagWriter
+from beetle_omni_ros.model.mode import Mode
+from beetle_omni_ros.model.schema import RunError
 from beetle_omni_ros.ros import fly as fly_module
-from beetle_omni_ros.ros import fly as pace
-from beetle_omni_ros.ros.graph import plan
+
+FELL, LATE = 'emergency', 'this computer was too slow, it says'
 
 
-@pytest.mark.parametrize('cost, cores, text', [
-    (0.2, {0, 1}, ''), (0.2, {0}, 'real time needs 2 cores, this computer has 1'),
-    (0.3, {0, 1}, 'needs 120 % of a core, expected at most 95 %')])
-def test_a_slow_computer_or_one_core_is_named_and_a_stall_does_not_count(
-        monkeypatch, cost, cores, text):
-    clock, stalls = [0.0], [5.0]
+@pytest.mark.parametrize('options, outcome, clocks', [
+    ({}, (FELL, LATE), ['system', 'simulated']), ({}, ('', LATE), ['system']),
+    ({}, (FELL, ''), ['system']), ({'clock': 'simulated'}, (FELL, LATE), ['simulated']),
+    ({'clock': 'system'}, (FELL, LATE), ['system']),
+    ({'actuators': 'emulated'}, (FELL, LATE), ['system'])])
+def test_a_late_flight_is_kept_and_flown_again_where_the_clock_is_free(
+        tmp_path, monkeypatch, capfd, options, outcome, clocks):
+    bag, flown = tmp_path / 'bag', []
 
-    def run(duration):
-        clock[0] += cost * duration + (stalls.pop() if stalls else 0.0)
-
-    monkeypatch.setattr(pace, '_loop', lambda *_: SimpleNamespace(take_off=lambda: None, run=run))
-    monkeypatch.setattr(time, 'perf_counter', lambda: clock[0])
-    monkeypatch.setattr(os, 'sched_getaffinity', lambda _: cores)
-    share, reason = pace.too_slow({}, None)
-    assert share == pytest.approx(pace.GRAPH * cost)
-    assert reason.endswith(text) and bool(reason) is bool(text)
-
-
-def test_the_pace_of_this_computer_is_measured_and_its_priority_restored():
-    before = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
-    share, _ = pace.too_slow(plan('hover', task='hover', standby=False)[0], None)
-    assert 0 < share < 10
-    assert (os.sched_getscheduler(0), os.sched_getparam(0).sched_priority) == before
-
-
-@pytest.mark.parametrize('actuators, slow, clock, said', [
-    (None, 'slow', 'simulated', 'slow; simulated time is used'),
-    (None, '', 'system', 'real time: the flight needs 50 % of a core'),
-    ('emulated', 'slow', 'system', 'slow; emulated devices have real time only')])
-def test_a_flight_says_its_clock_before_it_starts_and_leaves_a_film(
-        tmp_path, monkeypatch, capfd, actuators, slow, clock, said):
-    bag, printed = tmp_path / 'bag', []
-
-    def flown(graph, controller, task, *_):
-        printed.append(capfd.readouterr().out)
+    def flight(graph, controller, task, console, clock, choice):
+        flown.append(clock)
         assert ('joint_bridge_node' in graph.nodes) is (clock == 'system')
         with BagWriter(bag) as writer:
             fly(writer, task)
-        return '', ''
+        return outcome if len(flown) == 1 else ('', '')
 
-    monkeypatch.setattr(fly_module, '_fly', flown)
-    monkeypatch.setattr(fly_module, 'too_slow', lambda *_: (1.2 if slow else 0.5, slow))
+    monkeypatch.setattr(fly_module, '_fly', flight)
     monkeypatch.setattr(fly_module, 'viewer_process', lambda *_: open(os.devnull))
-    fly_module.run_fly(task='random2', bag=bag, actuators=actuators, view=True)
-    assert printed == [said + '\n']
-    assert read_bag(bag).meta['clock'] == clock
-    assert f'files: {bag / "flight.html"}' in capfd.readouterr().out.splitlines()
+    status = fly_module.run_fly(task='random2', bag=bag, view=True, **options)
+    out = capfd.readouterr().out
+    assert flown == clocks and status == bool(outcome[0] and len(clocks) == 1)
+    assert read_bag(bag).meta['clock'] == clocks[-1]
+    assert (f'{LATE}: flown again in simulated time' in out) is (len(clocks) > 1)
+    assert (tmp_path / 'bag_late').exists() is (len(clocks) > 1)
+    assert f'files: {bag / "flight.html"}' in out.splitlines()
     assert '__VISER_EMBED_DATA__' in (bag / 'flight.html').read_text()
+
+
+@pytest.mark.parametrize('states, lost, values, answer, text', [
+    (['fallback:commands_late'], 0.0, {'fault.commands_late': '3.0'}, '', 'came late'),
+    (['fallback'], 0.0, {'nmpc.refused.stale stamp': 4}, '', 'came late'),
+    (['fallback'], 0.0, {'nmpc.refused.jump': 4}, '', ''),
+    (['flying:nmpc'], 0.0, {'nmpc.refused.stale stamp': 4}, '', ''),
+    (['fallback'], 0.2, {}, '', 'the simulator fell 0.2 s behind'),
+    (['disarmed'], 0.0, {}, 'ekf_node late: the computer is too slow', 'came late')])
+@pytest.mark.parametrize('choice', [True, False])
+def test_a_fallback_with_late_messages_ends_a_flight_that_may_be_flown_again(
+        states, lost, values, answer, text, choice):
+    flight = fly_module.Flight(SimpleNamespace(domain=77, nodes={}, dead=dict), 'nmpc', None,
+                               lambda text: None, choice)
+    try:
+        flight._lost_before, flight._answer = 1.0, answer
+        flight.states = [Mode(state) for state in states]
+        flight.state = flight.states[-1]
+        for name, found in ((fly_module.PACING, {'lost_s': 1.0 + lost}),
+                            (fly_module.SUPERVISOR_STATUS, values)):
+            flight.diagnostics[name] = SimpleNamespace(values=found, level=0)
+        assert flight.slow().endswith(text) and bool(flight.slow()) is bool(text)
+        if choice and text and states[0].startswith('fallback'):
+            with pytest.raises(RunError, match=text):
+                flight.spin(0.0)
+        else:
+            flight.spin(0.0)
+    finally:
+        flight.close()
