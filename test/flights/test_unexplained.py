@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from beetle_omni_ros.identify.flights import discrepancy
 from beetle_omni_ros.identify.flights.discrepancy import of_thrusts
 from beetle_omni_ros.identify.flights.quality import line, repeatable, Unexplained
-from beetle_omni_ros.identify.flights.results import verdict_of
+from beetle_omni_ros.identify.flights.results import steady, verdict_of
 from beetle_omni_ros.identify.flights.spectrum import spectrum
 from beetle_omni_ros.model.parameters import RobotParameters
 
@@ -104,3 +104,13 @@ def test_a_vibration_is_a_line_of_its_frequency_in_flights_of_any_length():
 def test_a_name_with_a_tenth_of_what_repeats_unexplained_is_only_a_part(evidence, chance, verdict):
     rest = [Unexplained('repeatable', chance, 100.0, CHANNELS)]
     assert verdict_of(1e-4, [['wind']], rest, [], 0.05, evidence)[0] == verdict
+
+
+@pytest.mark.parametrize(('gain', 'trusted'), [(-1.2, True), (-1.1, False), (0.0, False)])
+def test_where_feedback_excludes_most_a_name_needs_evidence_of_one_value(gain, trusted):
+    assert steady(SimpleNamespace(unsteady={4: gain}), 4) is trusted
+    assert steady(SimpleNamespace(unsteady={}), 4)      # feedback cannot be what it explains
+    fed_back = ['command latency', 'rotor drag', 'wind']
+    assert verdict_of(1e-4, [['mass']], [], fed_back, 0.05, 9.0)[0] == 'named'
+    verdict, reason = verdict_of(1.0, [], [], fed_back, 0.05, 0.0)
+    assert verdict == 'not_decidable' and 'command latency, rotor drag, wind differ' in reason

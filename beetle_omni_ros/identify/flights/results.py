@@ -29,7 +29,9 @@ CROWD = 4               # members of a set from which the flights do not decide
 NAMING = 'named', 'named_set'
 WIDEST = 9.0            # typical deviations of the widest prior of an entry
 TESTS = 3               # of what is unexplained; they share the accepted probability
-MOST_FED_BACK = 2       # entries that feedback may exclude; with more, the loop hides the robot
+MOST_FED_BACK = 2       # entries that feedback may exclude; with more, the loop hides the robot,
+SUBSTANTIAL = log(10) / 2   # [nat] and only entries with such evidence of one value are named;
+                        # "substantial" on the scale of Jeffreys (Theory of Probability, 1961)
 FORM_DEVIATION = 0.1    # of a value: deviation by the error of form of its law
 MINOR = 0.1             # share of the gain of what repeats below which names explain too little
 STILL = 'noise hides the motion, so that only means are compared'
@@ -94,10 +96,11 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
     alpha = engine.alpha
     tests: list[tuple] = [(engine, solution, keys), *([(slow, slow, slow.keys)] if slow else [])]
     e_value = float(np.logaddexp.reduce([s.e_value for _, s, _ in tests])) - log(len(tests))
-    # where feedback hides the robot, no alpha names anything
-    chance = 1.0 if len(solution.banned) > MOST_FED_BACK else exp(min(0.0, -e_value))
+    chance, hides = exp(min(0.0, -e_value)), len(solution.banned) > MOST_FED_BACK
     found = [(e, s, own, k, members) for e, s, own in tests if chance <= alpha
-             for k, members in named_of(e, s, alpha)]
+             for k, members in named_of(e, s, alpha) if not hides or e is engine and steady(s, k)]
+    if hides and not found:     # no alpha names anything
+        chance = 1.0
     effects = [effect_of(s, e, own, k, members, starts) for e, s, own, k, members in found]
     weak = [effect for effect, (e, *_) in zip(effects, found, strict=True) if e is slow]
     keep = [one[0] is slow or not of_a_rotor(effect, weak)
@@ -153,6 +156,11 @@ def named_of(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int
         members = [k, *(j for less, j in sorted(rivals, reverse=True) if less > log(alpha))]
         named.append((-needed, k, members))
     return [(k, members) for _, k, members in sorted(named)]
+
+
+def steady(solution: Solution, k: int) -> bool:
+    """Whether an entry is out of the loop, or the bands show that it has one value."""
+    return -solution.unsteady.get(k, -np.inf) >= SUBSTANTIAL
 
 
 def effect_of(solution: Solution, engine: Engine, keys: dict[str, Key], k: int,
@@ -355,7 +363,7 @@ def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
         likely: entries that explain what repeats, but are not sure enough.
 
     """
-    if len(fed_back) > MOST_FED_BACK:
+    if len(fed_back) > MOST_FED_BACK and not sets:
         return 'not_decidable', (
             'the controller answers noise more than it flies: the values of '
             f"{', '.join(fed_back)} differ between frequencies")
