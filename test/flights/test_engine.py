@@ -97,24 +97,42 @@ def named(result):
     return {name for effect in result['effects'] for name in effect['names']}
 
 
+def shows_thrust_and_drag(result, scale=0.8, drag=0.012):
+    """Whether these two are named, with intervals that hold their sizes or miss by 1 %."""
+    found = {effect['names'][0]: effect['parameters'] for effect in result['effects']}
+    return set(found) == {'thrust_coefficient', 'rotor_drag'} and all(
+        low - 0.01 * true <= true <= high + 0.01 * true for true, (low, high) in (
+            (scale, found['thrust_coefficient']['scale']['interval']),
+            (drag, found['rotor_drag']['coefficient']['interval'])))
+
+
 def test_a_hidden_thrust_and_drag_are_named_with_their_sizes(tmp_path, capsys):
     flights = [write_flight(tmp_path / f'{k}.csv', k, scale=0.8, drag=0.012) for k in range(2)]
     page, file = tmp_path / 'gap.html', tmp_path / 'gap.json'
     assert cli.main(list(map(str, ['gap', *flights, '--format', 'nanobench', '--robot', ROBOT,
                                    '--report', page, '--json', file]))) == 0
     result = json.loads(file.read_text())
-    found = {effect['names'][0]: effect['parameters'] for effect in result['effects']}
-    assert {'thrust_coefficient', 'rotor_drag'} == set(found)
-    for name, key, true in (('thrust_coefficient', 'scale', 0.8),
-                            ('rotor_drag', 'coefficient', 0.012)):
-        low, high = found[name][key]['interval']
-        assert low - 0.01 * true <= true <= high + 0.01 * true
+    assert shows_thrust_and_drag(result)
     assert result['false_alarm_probability'] < 1e-3
     assert result['gap_after'] < 0.2 * result['gap_before'] + 0.8
     # no page is proposed that has just been written
     *_, then, last = capsys.readouterr().out.splitlines()
     assert then == f'next:  open {page} in a browser' and '--report' not in last
     assert last.startswith('next:  the same with --apply FILE')
+
+
+def test_names_and_sizes_are_those_of_flights_cut_turned_shifted_and_in_another_order(tmp_path):
+    turn, flights = Rotation.from_euler('z', 1.1), []
+    for k in range(2):
+        path = write_flight(tmp_path / f'{k}.csv', k, scale=0.8, drag=0.012)
+        rows = np.loadtxt(path, delimiter=',', skiprows=1)
+        rows[:, 0] += 123.4567
+        rows[:, 1:4], rows[:, 19:22] = turn.apply(rows[:, 1:4]), turn.apply(rows[:, 19:22])
+        rows[:, 4:8] = (turn * Rotation.from_quat(rows[:, 4:8])).as_quat()
+        for half, part in enumerate(np.array_split(rows, 2)):
+            flights.insert(0, tmp_path / f'{k}_{half}.csv')
+            np.savetxt(flights[0], part, delimiter=',', header=HEADER, comments='', fmt='%.7g')
+    assert shows_thrust_and_drag(gap_of(flights))
 
 
 def test_torques_that_balance_a_known_moment_show_it_although_the_robot_hardly_turns(tmp_path):
@@ -170,12 +188,7 @@ def test_without_accelerometer_positions_show_the_forces(by_mocap):
     result = by_mocap(range(2), scale=0.8, drag=0.012)
     assert result['groups']['force']['channels'] == ['force_x', 'force_y', 'force_z']
     assert 'no accelerometer' in result['groups']['acceleration']['reason']
-    found = {effect['names'][0]: effect['parameters'] for effect in result['effects']}
-    assert set(found) == {'thrust_coefficient', 'rotor_drag'}
-    for name, key, true in (('thrust_coefficient', 'scale', 0.8),
-                            ('rotor_drag', 'coefficient', 0.012)):
-        low, high = found[name][key]['interval']
-        assert low <= true <= high
+    assert shows_thrust_and_drag(result)
     assert not by_mocap(range(10, 12))['effects']
 
 
