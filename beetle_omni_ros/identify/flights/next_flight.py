@@ -25,7 +25,7 @@ from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import log_prior, Normal, normal, Solution
-from beetle_omni_ros.identify.flights.results import member_of, named_of, parameters, Starts
+from beetle_omni_ros.identify.flights.results import member_of, Starts, Weighed
 from beetle_omni_ros.identify.flights.spectrum import pooled
 from beetle_omni_ros.identify.flights.table_flight import TableFlight
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
@@ -67,8 +67,8 @@ class Explanation:
 
 def hypotheses_of(engine: Engine, solution: Solution) -> list[Explanation]:
     """The most probable members of the first open set, each with the other named entries."""
-    best = solution.best
-    unclear = [own for own in named_of(engine, solution, engine.alpha) if len(own[1]) > 1]
+    best, weighed = solution.best, Weighed(engine, solution, engine.flights[0].keys)
+    unclear = [own for own in weighed.named(engine.alpha) if len(own[1]) > 1]
     if not unclear:
         return []
     equations = normal(solution.spectra, engine.names, engine.flight)
@@ -306,11 +306,11 @@ def weak(robot: RobotParameters) -> RobotParameters:
 def plant_of(engine: Engine, solution: Solution, hypothesis: Explanation, robot: RobotParameters,
              starts: Starts | None) -> RobotParameters:
     """The robot file with the fitted values of a hypothesis, as far as they are possible."""
-    index = sorted(engine.indices(hypothesis.chosen))
-    posterior = solution.judge.posterior(index)
-    named = [{'names': [entry.name], **member_of(entry), 'parameters': parameters(
-        entry, engine, index, posterior, engine.flights[0].keys, starts or {})}
-        for entry in (solution.entries[k] for k in hypothesis.chosen) if not entry.varying]
+    found = Weighed(engine, solution, engine.flights[0].keys, starts or {})
+    entries = solution.entries
+    named = [{'names': [entries[k].name], **member_of(entries[k]),
+              'parameters': found.sizes(k, hypothesis.chosen)}
+             for k in hypothesis.chosen if not entries[k].varying]
     try:
         return robot_with(robot, effects_with(robot, named))
     except ParameterError:
