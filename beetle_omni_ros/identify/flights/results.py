@@ -75,7 +75,6 @@ class Weighed:
         solution: of the engine, or the balance.
         keys: keys by name.
         starts: as of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`.
-        told: key of an effect with the members that count as different.
 
     """
 
@@ -83,7 +82,6 @@ class Weighed:
     solution: Any
     keys: dict[str, Key]
     starts: Starts = field(default_factory=dict)
-    told: str = 'names'
 
     def named(self, alpha: float) -> list[tuple[int, list[int]]]:
         """
@@ -243,43 +241,43 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
             motion repeats as well, and is no force.
 
     """
-    alpha, searches = engine.alpha, [Weighed(engine, solution, keys, starts or {})]
-    searches += [Weighed(slow, slow, slow.keys, told='members')] if slow else []
-    e_value = np.logaddexp.reduce([own.solution.e_value for own in searches]) - log(len(searches))
+    alpha, weighed = engine.alpha, [Weighed(engine, solution, keys, starts or {})]
+    weighed += [Weighed(slow, slow, slow.keys)] if slow else []
+    e_value = np.logaddexp.reduce([own.solution.e_value for own in weighed]) - log(len(weighed))
     # where feedback hides the robot, no alpha names anything
     chance = 1.0 if len(solution.banned) > MOST_FED_BACK else exp(min(0.0, -e_value))
-    found = [(own, k, own.effect(k, members)) for own in searches if chance <= alpha
+    found = [(own, k, own.effect(k, members)) for own in weighed if chance <= alpha
              for k, members in own.named(alpha)]
-    weak = [effect for own, _, effect in found if own.solution is slow]
+    weak = [effect for own, _, effect in found if own is not weighed[0]]
     found = [one for one in found if not of_a_rotor(one[-1], weak)]
-    taken = [[k for own, k, _ in found if own is search] for search in searches]
-    sets = [effect[own.told] for own, _, effect in found]
-    rows = [row for own, named in zip(searches, taken, strict=True)
-            for row in own.candidates(named, alpha / len(searches))]
+    effects = [effect for *_, effect in found]
+    # the balance alone tells rotors apart
+    sets = [effect['names' if own is weighed[0] else 'members'] for own, _, effect in found]
     rest = unexplained(engine, solution) if measured else []
     likely = known_of(engine, solution) if rest and not sets else []
-    fed_back = sorted(solution.entries[k].name.replace('_', ' ') for k in solution.banned)
-    verdict, reason = verdict_of(chance, sets, rest, fed_back, alpha, max(
-        (effect['evidence']['ln_bayes_factor'] for *_, effect in found), default=0.0), likely)
-    told = [verdict in NAMING and len(members) < CROWD for members in sets]
-    named = taken[0] if verdict in NAMING else []
+    verdict, reason = verdict_of(
+        chance, sets, rest, [solution.entries[k].name for k in solution.banned], alpha,
+        max((effect['evidence']['ln_bayes_factor'] for effect in effects), default=0.0), likely)
+    accepted = [effect for effect, members in zip(effects, sets, strict=True)
+                if verdict in NAMING and len(members) < CROWD]
+    named = [k for own, k, _ in found if own is weighed[0] and verdict in NAMING]
+    fitted = {name: k for k, name in enumerate(engine.names[:engine.known])
+              if name in keys and k not in engine.indices(named)}
+    rows = [row for own in weighed for row in own.candidates(
+        [k for other, k, _ in found if other is own], alpha / len(weighed))]
     return result_of(
         verdict, {**groups, **{kind: groups[kind] | {'reason': STILL}
                                for kind in engine.without_motion()}}, reason,
-        effects=[effect for (*_, effect), is_told in zip(found, told, strict=True) if is_told],
-        partial=[effect for (*_, effect), is_told in zip(found, told, strict=True)
-                 if not is_told],
+        effects=accepted, partial=[effect for effect in effects if effect not in accepted],
         candidates=sorted(rows, key=_rank, reverse=True),
         hidden=[row['name'] for row in visible(rows) if size_seen(row) > 1],
         where=where_of(engine, solution), false_alarm_probability=chance, held_out=held_out,
         findings=[*findings, *varied(engine, solution), *(
             test.sentence[:1].upper() + test.sentence[1:] for test in rest
             if verdict != 'unknown' and not likely)],
-        noise_floor=1.0, **errors(engine, solution, named, judges),
-        tolerances={name: {'deviation': float(solution.theta[k]), 'relative': own.relative}
-                    for k, name in enumerate(engine.names[:engine.known])
-                    if (own := engine.flights[0].keys.get(name))
-                    and k not in engine.indices(named)})
+        noise_floor=1.0, **errors(engine, solution, named, judges), tolerances={
+            name: {'deviation': float(solution.theta[k]), 'relative': keys[name].relative}
+            for name, k in fitted.items()})
 
 
 def known_of(engine: Engine, solution: Solution) -> list[str]:
@@ -296,13 +294,18 @@ def known_of(engine: Engine, solution: Solution) -> list[str]:
 
 def of_a_rotor(effect: dict, weak: list[dict]) -> bool:
     """Whether an effect is that all rotors are weak, because one of the ``weak`` ones is."""
-    thrusts, rotors = ([
-        one['parameters']['scale'] for each in effects
-        for one in [each | {'name': each['names'][0]}, *each.get('rivals', [])]
-        if one['name'] == name] for effects, name in (
-            ([effect], 'thrust_coefficient'), (weak, 'rotor_thrust_coefficient')))
-    return any(low <= thrust['file'] * (3 + rotor['value'] / rotor['file']) / 4 <= high
-               for thrust in thrusts for low, high in [thrust['interval']] for rotor in rotors)
+    rotors = [rotor for each in weak for rotor in _scales(each, 'rotor_thrust_coefficient')]
+    for thrust in _scales(effect, 'thrust_coefficient'):
+        low, high = thrust['interval']
+        return any(low <= thrust['file'] * (3 + rotor['value'] / rotor['file']) / 4 <= high
+                   for rotor in rotors)
+    return False
+
+
+def _scales(effect, name):
+    """Scales of the members of an effect with this name."""
+    members = {'name': effect['names'][0], **effect}, *effect.get('rivals', [])
+    return [one['parameters']['scale'] for one in members if one['name'] == name]
 
 
 def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
@@ -327,7 +330,7 @@ def verdict_of(chance: float, sets: list[list[str]], rest: list[Unexplained],
     rules = (
         (len(fed_back) > MOST_FED_BACK, 'not_decidable', (
             'the controller answers noise more than it flies: the values of '
-            f"{', '.join(fed_back)} differ between frequencies")),
+            f"{', '.join(sorted(fed_back))} differ between frequencies".replace('_', ' '))),
         (small and not minor, 'named_set' if max(small, default=0) > 1 else 'named', ''),
         (sets and not small, 'not_decidable', 'they do not separate ' + ' and '.join(
             map(' or '.join, sets)).replace('_', ' ')),

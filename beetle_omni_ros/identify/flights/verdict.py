@@ -56,22 +56,27 @@ LATE = 0.0, 0.012, 0.024     # [s] latencies of commands, as apart as a linear d
 BAG_GROUPS = {group: {'used': True, 'channels': [c for c in BagFlight.channels
                                                  if c.startswith(group)]}
               for group in ('force', 'torque', 'acceleration', 'rate', 'joint')}
-# Entries of each group of channels. Those of the torques also need the forces.
-FORCES = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_drag',
-          'axial_inflow', 'translational_lift', 'wind', 'wind_velocity', 'voltage_sag',
-          'rotor_lag', 'rotor_dead_time', 'command_latency', 'imu_accelerometer_bias',
-          'imu_misalignment', 'imu_lever_arm', 'formula')
 HUB = 'rotor_hub_moment'
 TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coefficient', HUB,
            'propeller_gyroscopic_torque', 'rotor_acceleration_torque')
+LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
+IMU = 'imu_accelerometer_bias', 'imu_misalignment', 'imu_lever_arm'
+# Entries of tables that are not of torques.
+OTHERS = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_drag',
+          'axial_inflow', 'translational_lift', 'wind', 'wind_velocity', 'voltage_sag',
+          'formula', *LAGS, *IMU, 'imu_gyroscope_bias', 'mocap_misalignment')
+# What shows entries of tables: begins of names of signals and channels, one of which is there.
+SHOWN_BY = (
+    (('torque_',), TORQUES), (('voltage',), ('voltage_sag',)),
+    (('acceleration_', 'rate_'), ('imu_gyroscope_bias', 'mocap_misalignment')),
+    (('angular_velocity',), ('imu_lever_arm',)), (('position',), ('ground_effect',)),
+    (('position', 'velocity'), ('rotor_drag', 'body_drag', 'axial_inflow', 'translational_lift',
+                                HUB)),
+    (('force_x',), ('imu_misalignment', 'wind', 'wind_velocity', 'rotor_drag', 'body_drag')))
 FEEDBACK = ('the commands explain too little of the angular acceleration: a controller that feeds '
             'back what the model lacks would be taken for the robot')
 BALANCED = 'they show the hub moment alone, which the commands balance'
 WEIGHED = 'mass', 'inertia'
-LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
-IMU = 'imu_accelerometer_bias', 'imu_misalignment', 'imu_lever_arm'
-# Entries of the comparison of IMU and MoCap.
-SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
 Then = Callable[[Engine, Solution, dict, Starts | None, list], dict]   # adds; last: judges
 
 
@@ -197,24 +202,11 @@ def _delays(robot, p, coarse):
 
 def _engine(flights, robot, p, declared, alpha, torques=TORQUES):
     """Engine of flights of tables with the entries that channels and signals can show."""
-    channels, signals, names = flights[0].channels, set(declared.signals), set(FORCES)
-    if any(name.startswith('torque') for name in channels):
-        names |= set(torques)
-    if any(name.startswith(COMPARED) for name in channels):
-        names |= set(SENSORS)
-    if by_mocap(signals):
+    there = *flights[0].channels, *declared.signals
+    names = {*OTHERS, *torques}.difference(*(hidden for needed, hidden in SHOWN_BY if not any(
+        name.startswith(needed) for name in there)))
+    if by_mocap(declared.signals):
         names = names - {*IMU} | {'mocap_misalignment'}
-    if 'angular_velocity' not in signals:
-        names -= {'imu_lever_arm'}
-    if 'position' not in signals:
-        names -= {'ground_effect'}
-    if not {'position', 'velocity'} & signals:
-        names -= {'rotor_drag', 'body_drag', 'axial_inflow', 'translational_lift',
-                  'rotor_hub_moment'}
-    if 'voltage' not in signals:
-        names -= {'voltage_sag'}
-    if 'force_x' not in channels:
-        names -= {'imu_misalignment', 'wind', 'wind_velocity', 'rotor_drag', 'body_drag'}
     keys = keys_of(robot, names - set(p.without))
     priors, entries, bounds, far = _priors(robot, keys, tolerances(p), declared.clock_deviation)
     far -= set(VERTICAL)
@@ -244,7 +236,7 @@ def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
     """
     if not {'duty', 'thrust'} & set(declared.signals):
         raise ParameterError(f"--format {declared.name}: expected the key 'duty' or 'thrust'")
-    keys = keys_of(robot, {*FORCES, *TORQUES, *SENSORS})
+    keys = keys_of(robot, {*OTHERS, *TORQUES})
     body = BodyModel(robot, {**all_keys(robot), **extra_keys(robot)}, tilting_modules(robot))
     return [TableFlight(table, robot, body, keys) for table in read_tables(paths, declared)]
 
