@@ -18,7 +18,7 @@ import yaml
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.flights.page import label
 from beetle_omni_ros.identify.flights.quality import errors
-from beetle_omni_ros.identify.flights.results import CROWD, result_of, Weighed
+from beetle_omni_ros.identify.flights.results import CROWD, result_of
 from beetle_omni_ros.identify.robot_file import rounded
 from beetle_omni_ros.model.files import write_text
 from beetle_omni_ros.model.formula import described, library
@@ -60,12 +60,13 @@ def _none(result, reason):
         *result['findings'], f'No formula: {reason}']}
 
 
-def _formula(terms, before, engine, solution, result, starts, judges):
+def _formula(terms, before, weighed, result, judges):
     """
     Results with a formula of the engine whose entries include the ``terms``, or why there is none.
 
     ``before`` are the results of the catalogue alone.
     """
+    engine, solution = weighed.engine, weighed.solution
     judge, entries, best = solution.judge, solution.entries, set(solution.best)
 
     def gain(one, other):
@@ -97,7 +98,7 @@ def _formula(terms, before, engine, solution, result, starts, judges):
     if alone['closure'] is None or alone['closure'] < CLOSED:
         return f'the best one of {MOST} terms closes {max(alone["closure"] or 0, 0):.0%} of the ' \
             'gap on the held-out flights'
-    found = Weighed(engine, solution, engine.flights[0].keys, starts or {})
+    found = replace(weighed, solution=solution)
     named = [(k, [j for j in members if entries[j].name != FORMULA])
              for k, members in found.named(engine.alpha) if entries[k].name != FORMULA]
     named = [(k, members) for k, members in named if len(members) < CROWD]

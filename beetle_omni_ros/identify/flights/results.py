@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from math import exp, inf, log
 from typing import Any
 
@@ -74,14 +74,15 @@ class Weighed:
         engine: with the fitted flights, or a balance of torques.
         solution: of the engine, or the balance.
         keys: keys by name.
-        starts: as of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`.
+        starts: as of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`; None:
+            those are no bags, whose robot can be simulated.
 
     """
 
-    engine: Engine | Balance
+    engine: Any
     solution: Any
     keys: dict[str, Key]
-    starts: Starts = field(default_factory=dict)
+    starts: Starts | None = None
 
     def named(self, alpha: float) -> list[tuple[int, list[int]]]:
         """
@@ -133,7 +134,7 @@ class Weighed:
         rows: dict[str, np.ndarray] = {}
         for name in entry.keys:
             start, _, tangent = name.partition('~')
-            for of, part in self.starts.get(start, {name: 1.0}).items():
+            for of, part in (self.starts or {}).get(start, {name: 1.0}).items():
                 if not tangent or tangent == of:
                     row = rows.setdefault(of, np.zeros(len(index)))
                     row[index.index(engine.index[name])] += part
@@ -188,10 +189,10 @@ class Weighed:
         The unit is % for a share of the robot file. The size of a limit is that of its start. A
         size is None beyond the start, where a secant is not valid, and beyond the widest prior.
         """
-        engine, name = self.engine, entry.keys[0]
+        engine, name, starts = self.engine, entry.keys[0], self.starts or {}
         size = self.solution.judge.least([engine.index[key] for key in entry.keys], evidence)
-        limit = name in self.starts
-        own, part = next(iter(self.starts[name].items())) if limit else (
+        limit = name in starts
+        own, part = next(iter(starts[name].items())) if limit else (
             name, float(engine.typical[engine.index[name]]))
         key = self.keys[own]
         unit = CATALOGUE[entry.name].parameters[key.parameter].unit
@@ -220,39 +221,39 @@ def member_of(entry: Entry) -> dict[str, int]:
         if entry.member is not None else {}
 
 
-def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: list,
-              groups: dict, held_out: bool, starts: Starts | None = None,
-              findings: Sequence[str] = (), slow: Balance | None = None,
-              measured: bool = True) -> dict:
+Then = Callable[[Weighed, dict, list], dict]    # adds to the results; the list: judges
+
+
+def concluded(forces: Weighed, judges: list, groups: dict, held_out: bool,
+              findings: Sequence[str] = (), slow: Balance | None = None, measured: bool = True,
+              then: Then | None = None) -> dict:
     """
     Results of a solution.
 
     Args:
-        engine: with the fitted flights.
-        solution: of the engine.
-        keys: keys by name.
+        forces: what the flights say.
         judges: flights that the errors are about.
         groups: as of :func:`result_of`.
         held_out: whether the judges are other flights than the fitted ones.
-        starts: as of :class:`Weighed`.
         findings: sentences about the flights.
         slow: balance of torques; the mean of both e-values is one.
         measured: whether forces are those of an accelerometer. What an estimator makes of the
             motion repeats as well, and is no force.
+        then: may add to the results.
 
     """
-    alpha, weighed = engine.alpha, [Weighed(engine, solution, keys, starts or {})]
-    weighed += [Weighed(slow, slow, slow.keys)] if slow else []
+    engine, solution, alpha = forces.engine, forces.solution, forces.engine.alpha
+    weighed = [forces] + ([Weighed(slow, slow, slow.keys)] if slow else [])
     e_value = np.logaddexp.reduce([own.solution.e_value for own in weighed]) - log(len(weighed))
     # where feedback hides the robot, no alpha names anything
     chance = 1.0 if len(solution.banned) > MOST_FED_BACK else exp(min(0.0, -e_value))
     found = [(own, k, own.effect(k, members)) for own in weighed if chance <= alpha
              for k, members in own.named(alpha)]
-    weak = [effect for own, _, effect in found if own is not weighed[0]]
+    weak = [effect for own, _, effect in found if own is not forces]
     found = [one for one in found if not of_a_rotor(one[-1], weak)]
     effects = [effect for *_, effect in found]
     # the balance alone tells rotors apart
-    sets = [effect['names' if own is weighed[0] else 'members'] for own, _, effect in found]
+    sets = [effect['names' if own is forces else 'members'] for own, _, effect in found]
     rest = unexplained(engine, solution) if measured else []
     likely = known_of(engine, solution) if rest and not sets else []
     verdict, reason = verdict_of(
@@ -260,12 +261,12 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
         max((effect['evidence']['ln_bayes_factor'] for effect in effects), default=0.0), likely)
     accepted = [effect for effect, members in zip(effects, sets, strict=True)
                 if verdict in NAMING and len(members) < CROWD]
-    named = [k for own, k, _ in found if own is weighed[0] and verdict in NAMING]
+    named = [k for own, k, _ in found if own is forces and verdict in NAMING]
     fitted = {name: k for k, name in enumerate(engine.names[:engine.known])
-              if name in keys and k not in engine.indices(named)}
+              if name in forces.keys and k not in engine.indices(named)}
     rows = [row for own in weighed for row in own.candidates(
         [k for other, k, _ in found if other is own], alpha / len(weighed))]
-    return result_of(
+    result = result_of(
         verdict, {**groups, **{kind: groups[kind] | {'reason': STILL}
                                for kind in engine.without_motion()}}, reason,
         effects=accepted, partial=[effect for effect in effects if effect not in accepted],
@@ -276,8 +277,9 @@ def concluded(engine: Engine, solution: Solution, keys: dict[str, Key], judges: 
             test.sentence[:1].upper() + test.sentence[1:] for test in rest
             if verdict != 'unknown' and not likely)],
         noise_floor=1.0, **errors(engine, solution, named, judges), tolerances={
-            name: {'deviation': float(solution.theta[k]), 'relative': keys[name].relative}
+            name: {'deviation': float(solution.theta[k]), 'relative': forces.keys[name].relative}
             for name, k in fitted.items()})
+    return result | then(forces, result, judges) if then else result
 
 
 def known_of(engine: Engine, solution: Solution) -> list[str]:

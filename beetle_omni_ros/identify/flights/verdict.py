@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +12,6 @@ from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.balance import Balance, SLOW
 from beetle_omni_ros.identify.flights.body import BodyModel, tilting_modules
 from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.evidence import Solution
 from beetle_omni_ros.identify.flights.keys import (
     all_keys,
     entries_of,
@@ -33,7 +32,14 @@ from beetle_omni_ros.identify.flights.keys import (
     VARYING,
     VERTICAL,
 )
-from beetle_omni_ros.identify.flights.results import ALPHA, concluded, result_of, Starts
+from beetle_omni_ros.identify.flights.results import (
+    ALPHA,
+    concluded,
+    result_of,
+    Starts,
+    Then,
+    Weighed,
+)
 from beetle_omni_ros.identify.flights.servo import starts_of
 from beetle_omni_ros.identify.flights.signals import IMU_LAG
 from beetle_omni_ros.identify.flights.table_flight import (
@@ -77,7 +83,6 @@ FEEDBACK = ('the commands explain too little of the angular acceleration: a cont
             'back what the model lacks would be taken for the robot')
 BALANCED = 'they show the hub moment alone, which the commands balance'
 WEIGHED = 'mass', 'inertia'
-Then = Callable[[Engine, Solution, dict, Starts | None, list], dict]   # adds; last: judges
 
 
 def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: RobotParameters,
@@ -126,9 +131,8 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     for model in others:
         model.settle(dict(zip(engine.names, engine.point_of(solution, solution.theta)[
             :engine.real], strict=False)))
-    result = concluded(engine, solution, keys, others or models, BAG_GROUPS, starts=starts,
-                       held_out=bool(judging))
-    return result | then(engine, solution, result, starts, others or models) if then else result
+    return concluded(Weighed(engine, solution, keys, starts), others or models, BAG_GROUPS,
+                     held_out=bool(judging), then=then)
 
 
 def _priors(robot, keys, tolerance, stamps=0.0):
@@ -186,18 +190,16 @@ def _delays(robot, p, coarse):
 
     Beyond a limit, a deviation is a finding. ``coarse`` sensors are also late.
     """
-    bus, imu = (-p.command_delay, p.bus_late), p.coarse_imu if coarse else p.imu_averaging
+    bus, imu = (p.bus_near, (-p.command_delay, p.bus_late)), \
+        p.coarse_imu if coarse else p.imu_averaging
     stamps = 2 * p.tolerance_delay      # a reading of the latest IMU may be as much later
     # A module can swing with the joint: its inertia over the servo's, as a logarithm.
     swing = float(np.log(max(tilting_modules(robot)[0] / robot.joints.inertia, 1.0)))
-    deviations = {TILT_BUS: p.bus_near, THRUST_BUS: p.bus_near, IMU_LAG: imu,
-                  SWING: p.tolerance_swing + swing}
-    limits = {TILT_BUS: bus, THRUST_BUS: bus, IMU_LAG: (0.0, imu + stamps),
-              SWING: (-p.tolerance_swing, swing + p.tolerance_swing)}
+    delays = {TILT_BUS: bus, THRUST_BUS: bus, IMU_LAG: (imu, (0.0, imu + stamps)), SWING: (
+        p.tolerance_swing + swing, (-p.tolerance_swing, swing + p.tolerance_swing))}
     if coarse:
-        deviations['joint_feedback_delay.delay'] = p.coarse_encoders
-        limits['joint_feedback_delay.delay'] = 0.0, p.coarse_encoders
-    return deviations, limits
+        delays['joint_feedback_delay.delay'] = p.coarse_encoders, (0.0, p.coarse_encoders)
+    return [{name: own[k] for name, own in delays.items()} for k in range(2)]
 
 
 def _engine(flights, robot, p, declared, alpha, torques=TORQUES):
@@ -285,10 +287,8 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
     if slow:
         groups['torque'] = {'used': True, 'channels': ['torque_x', 'torque_y'],
                             'reason': 'no gyroscope: means of 2 s, by the attitude'}
-    result = concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
-                       findings=findings, slow=Balance(slow, robot) if slow else None,
-                       measured=not estimated(declared))
-    return result | then(engine, solution, result, None, judges) if then else result
+    return concluded(Weighed(engine, solution, keys), judges, groups, bool(judging), findings,
+                     Balance(slow, robot) if slow else None, not estimated(declared), then)
 
 
 def _groups(flight, declared):
