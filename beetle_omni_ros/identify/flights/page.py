@@ -126,15 +126,15 @@ def grids(result: dict, brief: bool = True) -> list[Grid]:
     ``brief``: the largest rows, and groups only if one is not compared. Otherwise all but the
     candidates, which have a section of the page.
     """
-    groups, where = result['groups'], whole(result)
-    if brief:
-        where = where[:SHOWN]
-        groups = {} if all(group['used'] for group in groups.values()) else groups
-    blind = result['verdict'] in ('no_gap', 'not_decidable')
+    groups, where = result['groups'], whole(result)[:SHOWN if brief else None]
+    if brief and all(group['used'] for group in groups.values()):
+        groups = {}
     tables = [_damages(result['bad_data']), _effects(result), _formula(result), _gap(result),
-              _channels(where), _groups(groups),
-              evidence(result['candidates'], SHOWN if brief else 0),
-              seen(result['candidates'], SHOWN if brief and blind else 0)]
+              _channels(where), _groups(groups)]
+    if brief:
+        tables.append(evidence(result['candidates'][:SHOWN]))
+        if result['verdict'] in ('no_gap', 'not_decidable'):
+            tables.append(seen(visible(result['candidates'])[:SHOWN]))
     return [grid for grid in tables if grid.rows]
 
 
@@ -207,14 +207,14 @@ def _groups(groups):
          group.get('reason', '')] for name, group in groups.items()])
 
 
-def evidence(rows: list[dict], most: int | None = None) -> Grid:
-    """Table of candidates, the first ``most``; None: all."""
-    alone = any('seen_from' in row for row in rows)
+def evidence(rows: list[dict]) -> Grid:
+    """Table of candidates."""
+    how = 'for the entry alone' if any('seen_from' in row for row in rows) else \
+        'beside the accepted entries'
     return Grid('Candidates', ['entry', 'ln B', 'decision'], [
         [label(row), _cell(row['evidence']['ln_bayes_factor']),
-         'accepted' if row['accepted'] else row['reason']] for row in rows[:most]], note=(
-            f'ln B: evidence {"for the entry alone" if alone else "beside the accepted entries"}.'
-    ))
+         'accepted' if row['accepted'] else row['reason']] for row in rows],
+        note=f'ln B: evidence {how}.')
 
 
 def size_seen(row: dict) -> float:
@@ -232,11 +232,11 @@ def visible(rows: list[dict]) -> list[dict]:
     return sorted(best.values(), key=size_seen, reverse=True)
 
 
-def seen(rows: list[dict], most: int | None = None) -> Grid:
-    """Table of the sizes from which effects would have been named, the first ``most``."""
+def seen(rows: list[dict]) -> Grid:
+    """Table of the sizes from which effects would have been named."""
     return Grid('What would have been seen', ['effect', 'from', 'typical'], [
         [_spelled(row['name']), _seen_text(row, 'value'), _seen_text(row, 'typical')]
-        for row in visible(rows)[:most]], note=(
+        for row in visible(rows)], note=(
             'from: size that these flights would have shown in the mean; smaller ones may be '
             'there. %: of the value in the robot file. A limit is seen at this value or below.'))
 

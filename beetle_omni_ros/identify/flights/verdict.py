@@ -293,15 +293,11 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
 
 def _groups(flight, declared):
     """Each group of channels: whether it is used, and why not."""
-    groups = {}
-    for group in GROUPS:
-        own = {c: why for c, why in flight.reasons.items() if c.startswith(group)}
-        used = [c for c, why in own.items() if not why]
-        unused = sorted({why for why in own.values() if why})
-        groups[group] = {'used': bool(used), 'channels': used,
-                         **({'reason': '; '.join(unused)} if unused else {})}
-    signals = declared.signals
-    groups['joint'] = {'used': False, 'channels': [],
-                       'reason': 'not compared for tables' if 'tilt' in signals
-                       else 'the rotors do not tilt'}
+    reasons, groups = flight.reasons | {'joint': 'not compared for tables' if (
+        'tilt' in declared.signals) else 'the rotors do not tilt'}, {}
+    for group in (*GROUPS, 'joint'):
+        own = {c: why for c, why in reasons.items() if c.startswith(group)}
+        used, unused = [c for c, why in own.items() if not why], sorted({*own.values()} - {''})
+        groups[group] = {'used': bool(used), 'channels': used} | (
+            {'reason': '; '.join(unused)} if unused else {})
     return groups
