@@ -74,8 +74,8 @@ class Weighed:
         engine: with the fitted flights, or a balance of torques.
         solution: of the engine, or the balance.
         keys: keys by name.
-        starts: as of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`; None:
-            those are no bags, whose robot can be simulated.
+        starts: as of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`; None: of
+            tables, whose robot is not simulated.
 
     """
 
