@@ -201,7 +201,8 @@ class Weighed:
         elif limit:
             value, typical = key.value(part), None
         else:
-            unit, value, typical = '%', *(100 * float(np.expm1(x)) for x in (size * part, part))
+            unit, value, typical = '%', *(100 * float(np.expm1(x * part))
+                                          for x in (min(size, WIDEST), 1.0))
         return {'value': value if size <= (1 if limit else WIDEST) else None, 'unit': unit,
                 'typical': typical}
 
