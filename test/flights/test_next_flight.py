@@ -23,6 +23,7 @@ from beetle_omni_ros.identify.flights.next_flight import (
     posterior_of,
     Sight,
 )
+from beetle_omni_ros.identify.flights.results import Weighed
 from beetle_omni_ros.identify.flights.spectrum import spectrum
 from beetle_omni_ros.identify.flights.table_flight import TableFlight
 from beetle_omni_ros.identify.flights.verdict import judged_tables, load_tables
@@ -85,7 +86,7 @@ def test_a_density_that_is_very_wide_in_one_direction_has_the_noise_in_the_other
 @pytest.mark.parametrize('verdict', ['named', 'no_gap', 'unknown'])
 def test_after_a_decision_there_is_no_task(verdict, tmp_path):
     path = tmp_path / 'next.yaml'
-    found = Planner(None, None, None, path)(None, None, {'verdict': verdict})['next_flight']
+    found = Planner(None, None, None, path)(None, {'verdict': verdict})['next_flight']
     assert found['task'] is None and not path.exists()
     assert found['sentence'].startswith(f'{verdict}: there is nothing to decide')
 
@@ -94,9 +95,9 @@ def test_the_most_decisive_poses_that_keep_their_margins_with_all_candidates_are
         monkeypatch, tmp_path):
     view, own = outlook(), hypotheses()
     sizes = {3: 3.0, 4: 4.0, 5: None}       # seed -> information; None: margin lost
-    monkeypatch.setattr(next_flight, 'hypotheses_of', lambda engine, solution: own)
+    monkeypatch.setattr(next_flight, 'hypotheses_of', lambda weighed: own)
     monkeypatch.setattr(next_flight, 'Outlook', lambda *_: view)
-    monkeypatch.setattr(next_flight, 'plant_of', lambda engine, solution, one, *_: one.label)
+    monkeypatch.setattr(next_flight, 'plant_of', lambda weighed, one, robot: one.label)
     monkeypatch.setattr(next_flight, 'grams_of', lambda engine, solution, flight: [
         gram([flight.size, -flight.size, 0, 0])])
     monkeypatch.setattr(Planner, '_flown', lambda self, engine, poses, plant: None if sizes[
@@ -107,7 +108,8 @@ def test_the_most_decisive_poses_that_keep_their_margins_with_all_candidates_are
         flown=lambda poses, plant: None if (poses[0, 0], plant) == (4, 'b') else 'a log',
         write=lambda path, poses, level, head: written.update(poses=poses, level=level, head=head))
     found = Planner(None, None, experiments, tmp_path / 'next.yaml')(
-        SimpleNamespace(flights=[0]), None, {'verdict': 'named_set'}, starts={})['next_flight']
+        Weighed(SimpleNamespace(flights=[0]), None, {}, starts={}), {'verdict': 'named_set'}
+    )['next_flight']
     assert found['poses'] == written['poses'].tolist() == [[3.0] * 6]
     right = view.chances([gram([3.0, -3.0, 0, 0])])
     assert found['probability'] == pytest.approx(right[:, 0].mean())

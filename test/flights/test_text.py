@@ -73,7 +73,7 @@ def test_the_least_visible_effects_come_first_with_the_size_from_which_they_are_
                 ('joint_velocity_limit', 9.3, None, 'rad/s'), ('mass', 4.0, 5.0, '%'),
                 ('joint_torque_limit', None, None, 'N m'), ('joint_offset', 0.3, 0.1, 'rad'),
                 ('joint_offset', 0.05, 0.1, 'rad'), ('tilt_thrust_loss', 0.12, 0.06, '1'))]
-    assert seen(rows, 5).rows == [
+    assert seen(rows).rows == [
         ['joint torque limit', 'not by these flights', ''], ['tilt thrust loss', '0.12', '0.06'],
         ['mass', '4 %', '5 %'], ['joint offset', '0.05 rad', '0.1 rad'],
         ['joint velocity limit', '9.3 rad/s', '']]

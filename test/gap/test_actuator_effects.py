@@ -11,7 +11,7 @@ from beetle_omni_ros.identify.flights import engine as engine_module
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.keys import Entry, of_start, Prior
 from beetle_omni_ros.identify.flights.quality import errors
-from beetle_omni_ros.identify.flights.results import effect_of
+from beetle_omni_ros.identify.flights.results import Weighed
 from beetle_omni_ros.identify.flights.servo import (
     module_load,
     simulate,
@@ -206,7 +206,8 @@ def test_a_torque_limit_keeps_its_value_when_it_is_linearised_again(factor, roun
         key.name: starts_of(key, [made])[0][0] + np.log(factor)}})
     solution = engine.run()
     assert solution.best == (0,)
-    stated = effect_of(solution, engine, KEYS, 0, [0], made.starts)['parameters']['effort_limit']
+    found = Weighed(engine, solution, KEYS, made.starts).effect(0, [0])
+    stated = found['parameters']['effort_limit']
     assert stated['value'] == pytest.approx(0.05, rel=0.03)
 
 
@@ -216,7 +217,7 @@ def test_starts_that_are_not_named_do_not_act_in_the_flights_that_judge():
         for k, size in enumerate((0.003, 0.008, 0.02))})
     solution = engine.run()
     assert solution.best == (1,) and solution.theta[engine.index['joint_friction@2']] != 0
-    assert errors(engine, solution, [1], engine.flights)[3] > 0.9
+    assert errors(engine, solution, [1], engine.flights)['closure'] > 0.9
 
 
 def one_servo(**changes):
@@ -254,7 +255,7 @@ def test_friction_of_one_servo_is_that_of_its_joint_and_friction_of_all_is_one_e
     solution = engine.run()
     entry, = (engine.entries[k] for k in solution.best)
     assert (entry.name, entry.member) == ('joint_friction', joint)
-    found = effect_of(solution, engine, KEYS, *solution.best, [*solution.best], made.starts)
+    found = Weighed(engine, solution, KEYS, made.starts).effect(*solution.best, solution.best)
     assert found.get('joint') == joint
     assert found['parameters']['coulomb']['value'] == pytest.approx(0.008, abs=0.0012)
 

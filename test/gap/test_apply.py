@@ -10,7 +10,7 @@ import pytest
 
 from beetle_omni_ros.identify.flights.apply import write_corrected
 from beetle_omni_ros.identify.flights.keys import entries_of, Entry
-from beetle_omni_ros.identify.flights.results import FORM_DEVIATION, parameters
+from beetle_omni_ros.identify.flights.results import FORM_DEVIATION, Weighed
 from beetle_omni_ros.model.effects import CATALOGUE, ignored
 from beetle_omni_ros.model.parameters import RobotParameters
 
@@ -48,10 +48,12 @@ def stated(entry, deviation=0.0, half=0.1, starts=None):
     """Parameters of an entry whose keys were all found at ``deviation`` +- ``half``."""
     count = len(entry.keys)
     engine = SimpleNamespace(index={key: k for k, key in enumerate(entry.keys)},
-                             typical=np.full(count, 0.3))
+                             typical=np.full(count, 0.3), indices=lambda chosen: range(count))
     posterior = SimpleNamespace(estimate=np.full(count, deviation),
                                 covariance=np.eye(count) * (half / 1.96)**2)
-    return parameters(entry, engine, list(range(count)), posterior, KEYS, starts or {})
+    solution = SimpleNamespace(entries=[entry], judge=SimpleNamespace(
+        posterior=lambda index: posterior))
+    return Weighed(engine, solution, KEYS, starts or {}).sizes(0, [0])
 
 
 @pytest.mark.parametrize('name, deviation, expected', [

@@ -104,10 +104,11 @@ def test_a_set_that_replaces_another_is_linearised_at_its_own_values(monkeypatch
     recordings = [prepare(read_recording(flight('windy_0')), own, P, False)]
     monkeypatch.setattr(engine, 'MOST_ROUNDS', 1)
 
-    def then(weighed, solution, *_):
-        entry = next(k for k, e in enumerate(weighed.entries) if e.name == 'thrust_coefficient')
-        for key, each in (('before', solution), ('after', weighed.again(solution, (entry,)))):
-            found[key] = 1.5 * np.exp(each.theta[weighed.index['thrust_coefficient.scale']])
+    def then(weighed, *_):
+        made, solution = weighed.engine, weighed.solution
+        entry = next(k for k, e in enumerate(made.entries) if e.name == 'thrust_coefficient')
+        for key, each in (('before', solution), ('after', made.again(solution, (entry,)))):
+            found[key] = 1.5 * np.exp(each.theta[made.index['thrust_coefficient.scale']])
         return {}
     judged(recordings, [], own, P, then=then)
     assert abs(found['before'] - 1) > 0.05 and found['after'] == pytest.approx(1.0, abs=0.02)

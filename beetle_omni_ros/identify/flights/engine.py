@@ -120,8 +120,10 @@ class Engine(Linearised):
         excluded, and the search begins again without it.
         """
         banned: dict[int, float] = {}
+        sought = None
         while True:
             solution = self._search(spectra, banned)
+            solution.sought = sought = solution.posterior.gain if sought is None else sought
             self._constancy(solution, banned)
             worst = max(solution.unsteady, key=solution.unsteady.get, default=None)
             if worst is None or solution.unsteady[worst] <= 0:

@@ -63,8 +63,7 @@ class Normal:
 
     def of_flight(self, k: int, theta: np.ndarray) -> np.ndarray:
         """(K,) deviations of flight k from the common ``theta`` (K,)."""
-        count = len(self.names)
-        theta = np.concatenate([theta[:count], self.of_generic(theta), theta[count:]])
+        theta = np.insert(theta, len(self.names), self.of_generic(theta))
         own, inner, left, right = self.flights[k]
         eta = np.zeros(len(theta))
         eta[own] = inner @ (right - left @ theta)
@@ -250,8 +249,7 @@ class Judge:
             return self._profiles[index]
         c = np.array(sorted({*index, *self.always}), dtype=int)
         if not len(c):
-            none = np.zeros(0)
-            return c, none, np.zeros((0, 0)), np.zeros((len(self.mean), 0)), none
+            return c, np.zeros(0), np.zeros((0, 0)), np.zeros((len(self.mean), 0)), np.zeros(0)
         own = np.linalg.inv(self.covariance[np.ix_(c, c)])
         direction = self.covariance[:, c] @ own                     # (K, d)
         info = positive(own - np.diag(self.narrow[c]**-2), self.narrow[c])[2]
@@ -346,6 +344,7 @@ class Solution:
         posterior: its evidence and estimate.
         unsteady: named entry -> gain of one value for each group of bands over one value [nat].
         banned: entry that was excluded for this -> its gain.
+        sought: gain of the best set before any was excluded [nat].
         plain: judge of a model without the generic discrepancy.
 
     """
@@ -361,6 +360,7 @@ class Solution:
     spectra: list[Spectrum] = field(default_factory=list)
     unsteady: dict[int, float] = field(default_factory=dict)
     banned: dict[int, float] = field(default_factory=dict)
+    sought: float = 0.0
 
     @property
     def theta(self) -> np.ndarray:
@@ -370,11 +370,10 @@ class Solution:
     @property
     def e_value(self) -> float:
         """Ln of the evidence of sets with an effect over those without, averaged by priors."""
-        parts: dict[bool, list[float]] = {True: [-np.inf], False: []}
-        for chosen, gain in self.gains.items():
-            effect = not all(self.entries[k].varying for k in chosen)
-            parts[effect].append(log_prior(len(chosen), len(self.entries)) + gain)
-        return float(np.logaddexp.reduce(parts[True]) - np.logaddexp.reduce(parts[False]))
+        some, none = (np.logaddexp.reduce([-inf, *(
+            log_prior(len(chosen), len(self.entries)) + gain for chosen, gain in self.gains.items()
+            if all(self.entries[k].varying for k in chosen) is empty)]) for empty in (False, True))
+        return float(some - none)
 
 
 def least_size(ratio: np.ndarray, evidence: float, scales: Sequence[float]) -> float:

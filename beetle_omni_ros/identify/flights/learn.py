@@ -18,7 +18,7 @@ import yaml
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.flights.page import label
 from beetle_omni_ros.identify.flights.quality import errors
-from beetle_omni_ros.identify.flights.results import CROWD, effect_of, named_of, result_of
+from beetle_omni_ros.identify.flights.results import CROWD, result_of
 from beetle_omni_ros.identify.robot_file import rounded
 from beetle_omni_ros.model.files import write_text
 from beetle_omni_ros.model.formula import described, library
@@ -60,12 +60,13 @@ def _none(result, reason):
         *result['findings'], f'No formula: {reason}']}
 
 
-def _formula(terms, before, engine, solution, result, starts, judges):
+def _formula(terms, before, weighed, result, judges):
     """
     Results with a formula of the engine whose entries include the ``terms``, or why there is none.
 
     ``before`` are the results of the catalogue alone.
     """
+    engine, solution = weighed.engine, weighed.solution
     judge, entries, best = solution.judge, solution.entries, set(solution.best)
 
     def gain(one, other):
@@ -93,32 +94,29 @@ def _formula(terms, before, engine, solution, result, starts, judges):
         deviations[engine.indices([k for k, entry in enumerate(entries)
                                    if entry.name == FORMULA and k not in own])] *= NOTHING
     solution = engine.again(solution, chosen)
-    at, after, floor, closure = errors(engine, solution, own, judges)
-    if closure is None or closure < CLOSED:
-        return f'the best one of {MOST} terms closes {max(closure or 0, 0):.0%} of the gap on ' \
-            'the held-out flights'
-    keys = engine.flights[0].keys
-    named = [(k, [j for j in members if entries[j].name != FORMULA]) for k, members in named_of(
-        engine, solution, engine.alpha) if entries[k].name != FORMULA]
-    effects = [effect_of(solution, engine, keys, k, members, starts)
-               for k, members in named if len(members) < CROWD]
-    each = [effect_of(solution, engine, keys, k, [k]) for k in own]
+    alone = errors(engine, solution, own, judges)
+    if alone['closure'] is None or alone['closure'] < CLOSED:
+        return f'the best one of {MOST} terms closes {max(alone["closure"] or 0, 0):.0%} of the ' \
+            'gap on the held-out flights'
+    found = replace(weighed, solution=solution)
+    named = [(k, [j for j in members if entries[j].name != FORMULA])
+             for k, members in found.named(engine.alpha) if entries[k].name != FORMULA]
+    named = [(k, members) for k, members in named if len(members) < CROWD]
+    each = [found.effect(k, [k]) for k in own]
     sizes = {term: effect['parameters']['coefficients'] | {'unit': described(term)[0]}
              for term, effect in zip((terms[entries[k].member - 1] for k in own), each)}
-    effects.append({**each[0], 'members': [FORMULA], 'term': None, 'expressions': list(sizes),
-                    'parameters': sizes})
-    start, end, all_of_it, share = errors(
-        engine, solution, [*own, *(k for k, members in named if len(members) < CROWD)], judges)
+    effects = [*(found.effect(k, members) for k, members in named), {
+        **each[0], 'members': [FORMULA], 'term': None, 'expressions': list(sizes),
+        'parameters': sizes}]
     return result_of(
         'named_set' if any(len(effect['members']) > 1 for effect in effects) else 'named',
         before['groups'], **{key: before[key] for key in (
             'hidden', 'findings', 'held_out', 'next_flight', 'meta')},
         **{key: result[key] for key in (
             'where', 'noise_floor', 'tolerances', 'false_alarm_probability')}, effects=effects,
-        closure=share, gap_before=start / all_of_it, gap_after=end / all_of_it,
+        **errors(engine, solution, [*own, *(k for k, _ in named)], judges),
         candidates=[row for row in result['candidates'] if row['name'] != FORMULA]) | {FORMULA: {
-            'ln_bayes_factor': more, 'closure': closure, 'gap_before': at / floor,
-            'gap_after': after / floor, 'terms_tried': len(terms),
+            'ln_bayes_factor': more, **alone, 'terms_tried': len(terms),
             'ranges': ranges(engine.flights)}}
 
 

@@ -25,7 +25,7 @@ from beetle_omni_ros.identify.flights.apply import effects_with, robot_with
 from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.engine import Engine
 from beetle_omni_ros.identify.flights.evidence import log_prior, Normal, normal, Solution
-from beetle_omni_ros.identify.flights.results import member_of, named_of, parameters, Starts
+from beetle_omni_ros.identify.flights.results import member_of, Weighed
 from beetle_omni_ros.identify.flights.spectrum import pooled
 from beetle_omni_ros.identify.flights.table_flight import TableFlight
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
@@ -65,10 +65,10 @@ class Explanation:
     covariance: np.ndarray
 
 
-def hypotheses_of(engine: Engine, solution: Solution) -> list[Explanation]:
+def hypotheses_of(weighed: Weighed) -> list[Explanation]:
     """The most probable members of the first open set, each with the other named entries."""
-    best = solution.best
-    unclear = [own for own in named_of(engine, solution, engine.alpha) if len(own[1]) > 1]
+    engine, solution, best = weighed.engine, weighed.solution, weighed.solution.best
+    unclear = [own for own in weighed.named(engine.alpha) if len(own[1]) > 1]
     if not unclear:
         return []
     equations = normal(solution.spectra, engine.names, engine.flight)
@@ -217,17 +217,13 @@ class Planner:
     experiments: Any
     path: Path
 
-    def __call__(self, engine: Engine, solution: Solution, result: dict,
-                 starts: Starts | None = None, judges: Sequence = ()) -> dict[str, Any]:
+    def __call__(self, weighed: Weighed, result: dict, judges: Sequence = ()) -> dict[str, Any]:
         """
         Plan a flight, check it, and write it as a task.
 
         Args:
-            engine: with the flights so far.
-            solution: of the engine.
+            weighed: what the flights so far say.
             result: of the analysis.
-            starts: as of :class:`~beetle_omni_ros.identify.flights.bag_flight.BagFlight`; None:
-                flights of tables, whose robot is not simulated.
             judges: flights that judge, not used.
 
         Returns:
@@ -238,25 +234,25 @@ class Planner:
         """
         if result['verdict'] not in OPEN:
             return _without(f"{result['verdict']}: there is nothing to decide")
-        own, hypotheses = self.experiments, hypotheses_of(engine, solution)
+        engine, solution, level = weighed.engine, weighed.solution, weighed.starts is None
+        own, hypotheses = self.experiments, hypotheses_of(weighed)
         outlook = Outlook(engine, solution, hypotheses) if hypotheses else Sight(
             engine, solution, result['hidden'] or [r['name'] for r in result['candidates'][:MOST]])
         if not outlook.labels:
             return _without('the effects that are hidden show only in means of torques')
-        plants = [None] if starts is None else [
-            plant_of(engine, solution, each, self.robot, starts)
-            for each in hypotheses[:SIMULATED]] or [weak(self.robot)]
+        plants = [None] if level else [plant_of(weighed, each, self.robot)
+                                       for each in hypotheses[:SIMULATED]] or [weak(self.robot)]
         found = []
         # other poses after each flight
         for seed in range(TASKS * len(engine.flights), TASKS * (len(engine.flights) + 1)):
-            poses = own.poses(seed, level=starts is None)
+            poses = own.poses(seed, level=level)
             flight = self._flown(engine, poses, plants[0])
             if flight is not None and flight.usable:
                 chances = outlook.chances(grams_of(engine, solution, flight))
                 found.append((float(outlook.weights @ chances[:, 0]), seed, poses, chances))
         for _, _, poses, chances in sorted(found, reverse=True):
             if all(own.flown(poses, plant) is not None for plant in plants[1:]):
-                return {'next_flight': self._written(outlook, chances, poses, starts is None)}
+                return {'next_flight': self._written(outlook, chances, poses, level)}
         return _without('no random poses keep their margins with all candidates')
 
     def _flown(self, engine, poses, plant):
@@ -303,14 +299,13 @@ def weak(robot: RobotParameters) -> RobotParameters:
                               'thrust_coefficient': {'scale': 1 - thrust}})
 
 
-def plant_of(engine: Engine, solution: Solution, hypothesis: Explanation, robot: RobotParameters,
-             starts: Starts | None) -> RobotParameters:
+def plant_of(weighed: Weighed, hypothesis: Explanation, robot: RobotParameters
+             ) -> RobotParameters:
     """The robot file with the fitted values of a hypothesis, as far as they are possible."""
-    index = sorted(engine.indices(hypothesis.chosen))
-    posterior = solution.judge.posterior(index)
-    named = [{'names': [entry.name], **member_of(entry), 'parameters': parameters(
-        entry, engine, index, posterior, engine.flights[0].keys, starts or {})}
-        for entry in (solution.entries[k] for k in hypothesis.chosen) if not entry.varying]
+    entries = weighed.solution.entries
+    named = [{'names': [entries[k].name], **member_of(entries[k]),
+              'parameters': weighed.sizes(k, hypothesis.chosen)}
+             for k in hypothesis.chosen if not entries[k].varying]
     try:
         return robot_with(robot, effects_with(robot, named))
     except ParameterError:

@@ -28,9 +28,8 @@ def label(effect: dict) -> str:
     """Names of an effect or candidate with the number of its rotor or joint."""
     if len(effect.get('members', [])) > 1:
         return ' or '.join(effect['members'])
-    member = effect.get('rotor') or effect.get('joint') or effect.get('term')
-    names = ' or '.join(effect.get('names') or [effect['name']])
-    return names + (f' {member}' if member else '')
+    return ' '.join([' or '.join(effect.get('names') or [effect['name']]), *(
+        str(effect[kind]) for kind in ('rotor', 'joint', 'term') if effect.get(kind))])
 
 
 def first_label(effect: dict) -> str:
@@ -38,16 +37,25 @@ def first_label(effect: dict) -> str:
     return label({**effect, 'names': effect['names'][:1], 'members': []})
 
 
+def numbers(found: dict) -> np.ndarray:
+    """(n, 4) value, interval and value of the robot file of each number of a parameter."""
+    return np.column_stack([np.atleast_1d(found['value']), np.reshape(found['interval'], (-1, 2)),
+                            np.atleast_1d(found['file'])])
+
+
 def summary(result: dict) -> str:
     """The verdict as one or two sentences."""
-    verdict, reason = result['verdict'], result['reason']
+    verdict, reason, chance = (result[key] for key in (
+        'verdict', 'reason', 'false_alarm_probability'))
+    # without evidence against it, no gap is more likely
+    odds = '' if chance is None or chance >= 1 else ' The probability of a false alarm is ' + (
+        f'{chance:.1g}.' if chance >= LEAST_CHANCE else f'below {LEAST_CHANCE:g}.')
     if verdict in ('named', 'named_set'):
-        parts = [_effect_text(effect) for effect in result['effects']]
-        explain = 'explain' if len(parts) > 1 else 'explains'
+        effects = [_effect_text(effect) for effect in result['effects']]
+        explain = 'explain' if len(effects) > 1 else 'explains'
         closing = '' if result['closure'] is None else (
-            f'Adding it closes {result["closure"]:.0%} of the gap on {flown(result)}.')
-        return ' '.join(filter(None, [f'{_capital(listed(parts))} {explain} the disagreement.',
-                                      closing, _chance(result)]))
+            f' Adding it closes {result["closure"]:.0%} of the gap on {flown(result)}.')
+        return f'{_capital(listed(effects))} {explain} the disagreement.{closing}{odds}'
     if verdict == 'no_gap':
         text = 'Model and measurement agree to within noise and manufacturing tolerance.'
         if not result['hidden']:
@@ -60,10 +68,8 @@ def summary(result: dict) -> str:
         return f'These data cannot decide: {reason}.'
     if verdict == 'unknown':
         partial = [' or '.join(effect['names']) for effect in result['partial']]
-        return ' '.join(filter(None, [
-            f'No known effect explains the disagreement: {reason}.',
-            f'{_capital(listed(partial))} would explain a part.' if partial else '',
-            _chance(result)]))
+        part = f' {_capital(listed(partial))} would explain a part.' if partial else ''
+        return f'No known effect explains the disagreement: {reason}.{part}{odds}'
     further = len(result['bad_data']) - 1
     return (reason if reason.endswith('?') else f'{reason}.') + (
         f' {further} more {"fault is" if further == 1 else "faults are"} listed below.'
@@ -72,37 +78,38 @@ def summary(result: dict) -> str:
 
 def listed(words: list[str], last: str = 'and') -> str:
     """Join words as 'a, b and c'; a long list ends with the number of others."""
-    words = list(words)
     if len(words) > MOST_NAMED:
         words = [*words[:MOST_NAMED - 1], f'{len(words) - MOST_NAMED + 1} others']
     words = [_spelled(word) for word in words]
-    return f' {last} '.join(filter(None, [', '.join(words[:-1]), words[-1] if words else '']))
+    return f' {last} '.join(filter(None, [', '.join(words[:-1]), *words[-1:]]))
 
 
 def _spelled(name):
     return ' '.join(SPELLED.get(word, word) for word in name.replace('_', ' ').split(' '))
 
 
+def _capital(text):
+    return text[:1].upper() + text[1:]
+
+
 def _effect_text(effect):
-    several = effect.get('members', [])[1:]
-    names = [_spelled(name) for name in (effect['members'] if several else effect['names'])]
-    member = next((f' of {kind} {effect[kind]}' for kind in ('rotor', 'joint', 'term')
-                   if effect.get(kind) and not several), '')
+    several = len(effect.get('members', [])) > 1
+    names = ' or '.join(map(_spelled, effect['members' if several else 'names']))
+    member = ''.join(f' of {kind} {effect[kind]}' for kind in ('rotor', 'joint', 'term')
+                     if effect.get(kind) and not several)
     parameter, found = next(iter(effect['parameters'].items()))
-    values, own = _list(found['value']), _list(found['file'])
-    spans = [] if not found.get('interval') else [found['interval']] if np.ndim(
-        found['interval']) == 1 else found['interval']
-    sizes = ', '.join(_size(v, span) for v, span in zip(values, spans, strict=True))
+    rows = numbers(found)
     unit = '' if found['unit'] == '1' else f' {found["unit"]}'
+    sizes = ', '.join(_size(*row[:3]) for row in rows)
+    file = ', '.join(f'{own:.3g}' for own in rows[:, 3]) + unit if rows[:, 3].any() else 'none'
     what = f'{parameter}; ' if len(CATALOGUE[effect['names'][0]].parameters) > 1 else ''
-    file = ', '.join(f'{value:.3g}' for value in own) + unit if any(own) else 'none'
-    return f'{" or ".join(names)}{member} of {sizes}{unit} ({what}robot file: {file})'
+    return f'{names}{member} of {sizes}{unit} ({what}robot file: {file})'
 
 
-def _size(value, span):
-    below, above = value - span[0], span[1] - value
+def _size(value, low, high):
+    below, above = value - low, high - value
     if abs(above - below) > LOPSIDED * (above + below):
-        return f'{value:.3g} ({span[0]:.2g} to {span[1]:.2g})'
+        return f'{value:.3g} ({low:.2g} to {high:.2g})'
     return f'{value:.3g} +- {(below + above) / 2:.2g}'
 
 
@@ -112,22 +119,6 @@ def flown(result: dict) -> str:
         'the held-out flights' if result['held_out'] else 'the fitted flights'
 
 
-def _chance(result):
-    chance = result.get('false_alarm_probability')
-    if chance is None or chance >= 1:   # the evidence of the catalogue is against a gap
-        return ''
-    size = f'{chance:.1g}' if chance >= LEAST_CHANCE else f'below {LEAST_CHANCE:g}'
-    return f'The probability of a false alarm is {size}.'
-
-
-def _capital(text):
-    return text[:1].upper() + text[1:]
-
-
-def _list(value):
-    return value if isinstance(value, list) else [value]
-
-
 def grids(result: dict, brief: bool = True) -> list[Grid]:
     """
     Tables of damages, effects, gap, channels, groups and candidates.
@@ -135,15 +126,15 @@ def grids(result: dict, brief: bool = True) -> list[Grid]:
     ``brief``: the largest rows, and groups only if one is not compared. Otherwise all but the
     candidates, which have a section of the page.
     """
-    groups, where = result.get('groups', {}), whole(result)
-    if brief:
-        where = where[:SHOWN]
-        groups = {} if all(group['used'] for group in groups.values()) else groups
-    blind = result['verdict'] in ('no_gap', 'not_decidable')
+    groups, where = result['groups'], whole(result)[:SHOWN if brief else None]
+    if brief and all(group['used'] for group in groups.values()):
+        groups = {}
     tables = [_damages(result['bad_data']), _effects(result), _formula(result), _gap(result),
-              _channels(where), _groups(groups),
-              evidence(result['candidates'], SHOWN if brief else 0),
-              seen(result['candidates'], SHOWN if brief and blind else 0)]
+              _channels(where), _groups(groups)]
+    if brief:
+        tables.append(evidence(result['candidates'][:SHOWN]))
+        if result['verdict'] in ('no_gap', 'not_decidable'):
+            tables.append(seen(visible(result['candidates'])[:SHOWN]))
     return [grid for grid in tables if grid.rows]
 
 
@@ -155,14 +146,14 @@ def whole(result: dict) -> list[dict]:
 def _effects(result):
     rows = []
     for effect in result['effects'] or result['partial']:
-        ln = f"{effect['evidence']['ln_bayes_factor']:.0f}"
-        rivals = effect.get('rivals', [])
-        for first, one in [(first_label(effect) if rivals else label(effect), effect), *(
-                (f'or {label(rival)}', rival) for rival in rivals)]:
-            for k, (name, entry) in enumerate(one['parameters'].items()):
-                rows.append(['' if k else first, f"{name} [{entry['unit']}]",
-                             _numbers(entry['value']), _spans(entry.get('interval')),
-                             _numbers(entry['file']), '' if k or one is not effect else ln])
+        ones = [(first_label(effect), effect, f"{effect['evidence']['ln_bayes_factor']:.0f}"),
+                *((f'or {label(rival)}', rival, '') for rival in effect.get('rivals', []))]
+        for first, one, ln in ones:
+            for name, found in one['parameters'].items():
+                own = numbers(found)
+                rows.append([first, f"{name} [{found['unit']}]", _joined(own[:, 0]),
+                             _spans(own), _joined(own[:, 3]), ln])
+                first = ln = ''
     title = 'Effects' if result['effects'] else 'Partial explanation, not accepted'
     return Grid(title, ['effect', 'parameter', 'value', '95 %', 'in the file', 'ln B'], rows,
                 note='95 %: interval that contains the true value in 95 of 100 cases. ln B: '
@@ -177,7 +168,7 @@ def _formula(result):
     rows = []
     for term, size in result['effects'][-1]['parameters'].items():
         unit, words, symbols = described(term)
-        rows.append([symbols, words, f"{size['value']:.3g} {unit}", _spans(size['interval'])])
+        rows.append([symbols, words, f"{size['value']:.3g} {unit}", _spans(numbers(size))])
     where = listed([f'{name} {low:g} to {high:g}'
                     for name, (low, high) in found['ranges'].items()])
     return Grid('Formula', ['term', 'in words', 'k', '95 %'], rows, note=(
@@ -187,12 +178,9 @@ def _formula(result):
 
 
 def _gap(result):
-    if result['gap_before'] is None:
-        return Grid('', [], [])
-    rows = [[name, _cell(result[key])] for name, key in (
-        ('robot file', 'gap_before'), ('with the named effects', 'gap_after'))]
-    if not result['effects']:
-        del rows[1]
+    rows = [[name, _cell(result[key])] for name, key, shown in (
+        ('robot file', 'gap_before', result['gap_before'] is not None),
+        ('with the named effects', 'gap_after', result['effects'])) if shown]
     return Grid(f'Error over noise floor on {flown(result)}', ['model', 'error'], rows,
                 note='1 is the error of the most flexible fit to the same data.' + (
                     '' if 'joints' in result else ' Tolerances are as fitted.'))
@@ -219,13 +207,14 @@ def _groups(groups):
          group.get('reason', '')] for name, group in groups.items()])
 
 
-def evidence(rows: list[dict], most: int) -> Grid:
-    """Table of candidates, the first ``most``."""
-    shown = [[label(row), _cell(row['evidence']['ln_bayes_factor']),
-              'accepted' if row['accepted'] else row['reason']] for row in rows[:most]]
-    alone = any('seen_from' in row for row in rows)
-    return Grid('Candidates', ['entry', 'ln B', 'decision'], shown, note=(
-        f'ln B: evidence {"for the entry alone" if alone else "beside the accepted entries"}.'))
+def evidence(rows: list[dict]) -> Grid:
+    """Table of candidates."""
+    how = 'for the entry alone' if any('seen_from' in row for row in rows) else \
+        'beside the accepted entries'
+    return Grid('Candidates', ['entry', 'ln B', 'decision'], [
+        [label(row), _cell(row['evidence']['ln_bayes_factor']),
+         'accepted' if row['accepted'] else row['reason']] for row in rows],
+        note=f'ln B: evidence {how}.')
 
 
 def size_seen(row: dict) -> float:
@@ -243,11 +232,11 @@ def visible(rows: list[dict]) -> list[dict]:
     return sorted(best.values(), key=size_seen, reverse=True)
 
 
-def seen(rows: list[dict], most: int) -> Grid:
-    """Table of the sizes from which effects would have been named, the first ``most``."""
+def seen(rows: list[dict]) -> Grid:
+    """Table of the sizes from which effects would have been named."""
     return Grid('What would have been seen', ['effect', 'from', 'typical'], [
         [_spelled(row['name']), _seen_text(row, 'value'), _seen_text(row, 'typical')]
-        for row in visible(rows)[:most]], note=(
+        for row in visible(rows)], note=(
             'from: size that these flights would have shown in the mean; smaller ones may be '
             'there. %: of the value in the robot file. A limit is seen at this value or below.'))
 
@@ -273,15 +262,12 @@ def _cell(value):
     return ABSENT if value is None or not np.isfinite(value) else f'{value:.2f}'
 
 
-def _numbers(value):
-    return ', '.join(f'{v:.4g}' for v in _list(value))
+def _joined(values):
+    return ', '.join(f'{value:.4g}' for value in values)
 
 
-def _spans(interval):
-    if interval is None:
-        return ABSENT
-    if not np.ptp(interval, axis=-1).any():
+def _spans(rows):
+    if (rows[:, 1] == rows[:, 2]).all():
         return 'not fitted'
-    if isinstance(interval[0], list):
-        return ', '.join(f'{a:.3g}..{b:.3g}' for a, b in interval)
-    return f'{interval[0]:.4g}..{interval[1]:.4g}'
+    digits = 4 if len(rows) == 1 else 3
+    return ', '.join(f'{low:.{digits}g}..{high:.{digits}g}' for _, low, high, _ in rows)

@@ -13,6 +13,7 @@ from beetle_omni_ros.identify.flights.page import (
     first_label,
     grids,
     headline,
+    numbers,
     seen,
     whole,
 )
@@ -47,10 +48,10 @@ def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str
             section('Evidence', 'Every entry of the catalogue that these flights were compared '
                     'with. An effect is named if its evidence outweighs the number of entries '
                     f'that were tried and the accepted probability of a false alarm ({least:.1f} '
-                    'nat).', html(evidence(candidates, len(candidates)))),
+                    'nat).', html(evidence(candidates))),
             section('What would have been seen', 'The smallest size of each effect that these '
                     'flights would have shown, the least visible ones first.',
-                    html(seen(candidates, len(candidates)))),
+                    html(seen(candidates))),
             section('Tolerances', 'Deviations of this robot from the robot file, as fitted and '
                     'not named; --tolerances writes masses, gains, lags and rotor positions to '
                     'the robot file.', '<details><summary>All numbers</summary>'
@@ -73,7 +74,7 @@ def head(result: dict, picture: str = '') -> str:
 
 def picture_of(result: dict) -> Figure:
     """Disagreement by channel before and after, and the sizes of the effects with intervals."""
-    sizes = _sizes(result['effects'] or result['partial'])
+    sizes = [row for effect in result['effects'] or result['partial'] for row in _sizes(effect)]
     rows = sorted(whole(result), key=lambda row: row['channel'])[::-1]
     height = HEIGHT * max(len(rows), len(sizes)) + 0.6
     figure, axes = figures.panels(1, 2 if sizes else 1, height=height)
@@ -95,20 +96,15 @@ def picture_of(result: dict) -> Figure:
     return figure
 
 
-def _sizes(effects):
+def _sizes(effect):
     """Name, deviation and its interval of each number, over its typical deviation."""
-    result = []
-    for effect in effects:
-        several = len(effect.get('members', effect['names'])) > 1
-        text = first_label(effect) + ' or …' * several
-        for name, found in effect['parameters'].items():
-            values, file = np.atleast_1d(found['value']), np.atleast_1d(found['file'])
-            spans = np.reshape(found['interval'], (-1, 2))
-            for k, (value, own, span) in enumerate(zip(values, file, spans, strict=True)):
-                more = f' {"xyz"[k]}' if len(values) == 3 else ''
-                result.append((f'{text}\n{name}{more}', *(
-                    (x - own) / found['typical'] for x in (value, *span))))
-    return result
+    text = first_label(effect) + ' or …' * ('rivals' in effect)
+    for name, found in effect['parameters'].items():
+        rows = numbers(found)
+        for axis, (*sizes, own) in zip('xyz' if len(rows) == 3 else ' ' * len(rows), rows,
+                                       strict=True):
+            yield f'{text}\n{name} {axis}'.rstrip(), *(
+                (size - own) / found['typical'] for size in sizes)
 
 
 def _damage(recording, damage):

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc
@@ -49,19 +50,10 @@ def fitted(engine: Engine, solution: Solution, k: int) -> np.ndarray:
     return x
 
 
-def discrepancy_sizes(engine: Engine, solution: Solution) -> list[float]:
-    """RMS of the discrepancy in each channel, with its unit."""
-    weights = solution.equations.of_generic(solution.theta)
-    return [float(np.concatenate([
-        generic[flight.mask[:, c], c].reshape(-1, len(weights)) @ weights
-        for flight, generic in zip(engine.flights, engine.generic, strict=True)]).std())
-        for c in range(len(engine.channels))]
-
-
 def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Sequence
-           ) -> tuple[float, float, float, float | None]:
+           ) -> dict[str, Any]:
     """
-    Whitened RMS of flights without and with the named entries, and of a fit; closure.
+    Whitened RMS of flights without and with the named entries, over that of a fit; closure.
 
     Tolerances of the robot are as fitted, so that they count in none of the three: fitted again,
     they would explain the noise of these flights. The last fit adapts the named entries and the
@@ -69,42 +61,39 @@ def errors(engine: Engine, solution: Solution, named: Sequence[int], flights: Se
     The noise is that of the fitted flights. A deviation counts by its size over its prior, too, so
     that no flight takes a named effect as its own. Named sensors are those of all flights.
     """
-    generic = np.zeros(len(engine.names) - engine.known)
+    generic, keys = np.zeros(len(engine.names) - engine.known), engine.indices(named)
     theta = np.concatenate([solution.theta[:engine.known], generic])
     point = np.concatenate([engine.point_of(solution, solution.theta), generic])
     spectra, fitted = engine.others(flights, point)
-    noise, total, count = pooled(solution.spectra), np.zeros(3), 0
-    less = theta.copy()
-    less[engine.indices(named)] = 0.0
-    own, of_all = engine.flight.copy(), set(engine.indices(named))
+    less, own = theta.copy(), engine.flight.copy()
+    less[keys] = 0.0
     for _, key, column in engine.repeats:
-        if not fitted and key not in of_all:    # sensors of flights that judge may be others
+        if not fitted and key not in keys:    # sensors of flights that judge may be others
             own[key] = engine.typical[column]
     every = own.copy()
     every[engine.known:] = engine.narrow[engine.known:]
-    every[engine.indices(named)] += 9 * engine.typical[engine.indices(named)]
+    every[keys] += 9 * engine.typical[keys]
+    noise, total, count = pooled(solution.spectra), np.zeros(3), 0
     for each in spectra:
         each.noise = noise
         g, h = (part.sum(axis=(0, 1)) for part in each.grams())
         r2, noise_of_own = each.power(), 0.0
-        for k, (start, free) in enumerate((
-                (less, own), (theta, own), (theta, every))):
+        for k, (start, free) in enumerate(((less, own), (theta, own), (theta, every))):
             at = np.flatnonzero(free > 0)
             left, info = h - g @ start, g[np.ix_(at, at)]
             inner = np.linalg.inv(info + np.diag(free[at]**-2))
-            move = inner @ left[at]
-            total[k] += r2 - 2 * h @ start + start @ g @ start - left[at] @ move
+            total[k] += r2 - 2 * h @ start + start @ g @ start - left[at] @ (inner @ left[at])
             # what the wider priors explain of white noise alone
             explained = float(np.trace(inner @ info))
             noise_of_own = noise_of_own if k else explained
             total[k] += explained - noise_of_own
         count += each.size
     total = np.maximum(total, 1e-9 * count)
+    before, after, floor = np.sqrt(total / count).tolist()
     # chi2 that is left of the difference, if the flights show a difference at all
     closure = 1 - max(total[1] - total[2], 0.0) / (total[0] - total[2]) \
         if total[0] - total[1] > 2 * log(1 / engine.alpha) else None
-    before, after, floor = np.sqrt(total / count)
-    return float(before), float(after), float(floor), closure
+    return {'closure': closure, 'gap_before': before / floor, 'gap_after': after / floor}
 
 
 def where_of(engine: Engine, solution: Solution) -> list[dict]:
@@ -127,16 +116,17 @@ def where_of(engine: Engine, solution: Solution) -> list[dict]:
                                             strict=False)))])
     excess, rms = (np.sqrt([np.nanmean(np.concatenate(parts)**2, axis=0)
                             for parts in zip(*own, strict=True)]) for own in (whitened, raw))
-    rows: list[dict] = [
-        {'channel': name, 'regime': 'flight', 'excess': float(excess[0, c]),
-         'excess_after': float(excess[1, c]), 'rms': float(rms[0, c]),
-         'rms_after': float(rms[1, c]), 'discrepancy_rms': discrepancy,
-         'unit': UNITS[name.partition('_')[0]]}
-        for c, (name, discrepancy) in enumerate(zip(
-            engine.channels, discrepancy_sizes(engine, solution), strict=True))]
     before = np.concatenate([parts[0] for parts in raw])
     regime = np.concatenate([regimes_of(flight.motion) for flight in engine.flights])
+    weights, rows = solution.equations.of_generic(solution.theta), list[dict]()
     for c, name in enumerate(engine.channels):
+        discrepancy = np.concatenate([
+            generic[flight.mask[:, c], c].reshape(-1, len(weights)) @ weights
+            for flight, generic in zip(engine.flights, engine.generic, strict=True)])
+        rows.append({'channel': name, 'regime': 'flight', 'excess': float(excess[0, c]),
+                     'excess_after': float(excess[1, c]), 'rms': float(rms[0, c]),
+                     'rms_after': float(rms[1, c]), 'discrepancy_rms': float(discrepancy.std()),
+                     'unit': UNITS[name.partition('_')[0]]})
         for text in np.unique(regime):
             there = before[regime == text, c]
             there = there[np.isfinite(there)]
@@ -148,12 +138,10 @@ def where_of(engine: Engine, solution: Solution) -> list[dict]:
 
 def regimes_of(motion: dict[str, np.ndarray]) -> np.ndarray:
     """(N,) regime of each sample: rotate, near ground, translate, tilted or hover."""
-    regime = np.full(len(motion['velocity']), 'hover', dtype=object)
-    regime[np.abs(motion['tilt']).max(axis=1) > 1.0] = 'tilted'
-    regime[np.linalg.norm(motion['velocity'], axis=1) > 0.4] = 'translate'
-    regime[motion['position'][:, 2] < 0.6] = 'near ground'
-    regime[np.linalg.norm(motion['rate'], axis=1) > 0.8] = 'rotate'
-    return regime
+    return np.select([np.linalg.norm(motion['rate'], axis=1) > 0.8, motion['position'][:, 2] < 0.6,
+                      np.linalg.norm(motion['velocity'], axis=1) > 0.4,
+                      np.abs(motion['tilt']).max(axis=1) > 1.0],
+                     ['rotate', 'near ground', 'translate', 'tilted'], 'hover')
 
 
 @dataclass(frozen=True)
@@ -162,32 +150,21 @@ class Unexplained:
     Result of a test.
 
     Attributes:
-        kind: 'repeatable', 'line' or 'tolerance'.
+        what: no known effect explains, in words.
         probability: of a value as large without anything unexplained.
         gain: logarithm of the likelihood that the left-out blocks gain [nat]; of a line, that of
             its power; of a tolerance, that of its prior.
-        channels: those that show it, the largest first.
-        frequency: of a line [Hz].
-        number: of the robot, beyond its tolerance, in words.
 
     """
 
-    kind: str
+    what: str
     probability: float
     gain: float
-    channels: tuple[str, ...]
-    frequency: float | None = None
-    number: str = ''
 
     @property
     def sentence(self) -> str:
         """What was found, as the end of a sentence."""
-        what = 'a force or torque that depends on the motion and repeats'
-        if self.frequency:
-            what = f'a vibration of {self.frequency:.2g} Hz in ' + ' and '.join(
-                name.replace('_', ' ') for name in self.channels)
-        what = self.number or what
-        return f'no known effect explains {what} (probability {self.probability:.1g})'
+        return f'no known effect explains {self.what} (probability {self.probability:.1g})'
 
 
 def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
@@ -238,14 +215,14 @@ def repeatable(flights: list, spectra: list[Spectrum], left: list[np.ndarray],
         null = gains[-1][1:]
         excess.append((gains[-1] - null.mean()) / max(null.std(), 1e-9))
     most = np.max(excess, axis=0)
-    return Unexplained('repeatable', float(np.mean(most >= most[0])), float(
-        gains[np.argmax([one[0] for one in excess])][0]), tuple(channels[c] for c in own))
+    return Unexplained('a force or torque that depends on the motion and repeats', float(
+        np.mean(most >= most[0])), float(gains[np.argmax([one[0] for one in excess])][0]))
 
 
 def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, ...],
-         own: list[int]) -> Unexplained:
+         own: list[int]) -> Unexplained | None:
     """
-    Test of a periodic force or torque.
+    Test of a periodic force or torque; None: clocks allow slow motion only.
 
     Args:
         spectra: of the flights.
@@ -264,46 +241,44 @@ def line(spectra: list[Spectrum], left: list[np.ndarray], channels: tuple[str, .
     blocks, power = len(rest), rest.mean(axis=0)
     # a slope of the spectrum is no line, so the larger of both sides counts
     places = np.arange(NEAR, len(power) - NEAR)
-    if not len(places):     # clocks allow slow motion only
-        return Unexplained('line', 1.0, 0.0, ())
+    if not len(places):
+        return None
     ratio = np.array([power[k] / np.maximum(power[k - NEAR:k - 1].mean(axis=0),
                                             power[k + 2:k + NEAR + 1].mean(axis=0))
                       for k in places])
     k, c = np.unravel_index(ratio.argmax(), ratio.shape)
-    sides = NEAR - 1
-    chance = float(fdtrc(blocks, blocks * sides, ratio[k, c])) * ratio.size
-    order = np.argsort(-ratio[k])
-    return Unexplained('line', min(chance, 1.0), float(blocks * (
-        ratio[k, c] - 1 - np.log(ratio[k, c])) / 2), tuple(channels[own[i]] for i in order[:2]),
-        float(frequency[places[k]]))
+    chance = float(fdtrc(blocks, blocks * (NEAR - 1), ratio[k, c])) * ratio.size
+    shown = ' and '.join(channels[own[i]].replace('_', ' ') for i in np.argsort(-ratio[k])[:2])
+    return Unexplained(
+        f'a vibration of {frequency[places[k]]:.2g} Hz in {shown}', min(chance, 1.0),
+        float(blocks * (ratio[k, c] - 1 - np.log(ratio[k, c])) / 2))
 
 
-def beyond(engine: Engine, solution: Solution) -> Unexplained:
-    """Test of the numbers of the robot that have a tolerance, but are in no entry."""
+def beyond(engine: Engine, solution: Solution) -> Unexplained | None:
+    """Test of the numbers of the robot that have a tolerance, but are in no entry; None: none."""
     taken = {key for entry in engine.entries for key in entry.keys}
     own = [k for k, name in enumerate(engine.names[:engine.real])
            if name not in taken and not engine.kept[k]]
     if not own:
-        return Unexplained('tolerance', 1.0, 0.0, ())
+        return None
     sizes = solution.theta[own] / engine.narrow[own]
     most, k = float(np.abs(sizes).max()), own[int(np.argmax(np.abs(sizes)))]
     effect, _, index = engine.names[k].rstrip(']').partition('[')
-    place = int(index or 0)
-    off, percent = float(solution.theta[k]), float(100 * np.expm1(solution.theta[k]))
+    place, off = int(index or 0), float(solution.theta[k])
     what, size = {
-        'rotor.lag': (f'the lag of rotor {place + 1}', f'{percent:.2g} %'),
+        'rotor.lag': (f'the lag of rotor {place + 1}', f'{100 * np.expm1(off):.2g} %'),
         'position.offset': (f"the {'xyz'[place % 3]} of rotor {place // 3 + 1}",
                             f'{1000 * off:.2g} mm'),
         'modules.share': ('the effect of the tilting modules', f'{100 * off:.2g} %'),
     }.get(effect, (effect, f'{off:.2g}'))
     return Unexplained(
-        'tolerance', min(1.0, len(own) * float(chdtrc(1, most**2))), float(sizes @ sizes) / 2, (),
-        number=f'{what}, which is off by {size}, {most:.0f} standard deviations of its tolerance')
+        f'{what}, which is off by {size}, {most:.0f} standard deviations of its tolerance',
+        min(1.0, len(own) * float(chdtrc(1, most**2))), float(sizes @ sizes) / 2)
 
 
 def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
     """
-    The tests; the most improbable first.
+    What the tests show; the most improbable first. They share the accepted probability.
 
     Where an entry is excluded, or noise hides the motion, the controller feeds noise back, and
     what repeats may be its answer; nothing is tested there. Nor is it where commands balance
@@ -314,6 +289,8 @@ def unexplained(engine: Engine, solution: Solution) -> list[Unexplained]:
     if solution.banned or not own:
         return []
     left = [found.at(fitted(engine, solution, k)) for k, found in enumerate(solution.spectra)]
-    rows = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
-            line(solution.spectra, left, engine.channels, own), beyond(engine, solution)]
-    return sorted(rows, key=lambda row: row.probability)
+    tests = [repeatable(engine.flights, solution.spectra, left, engine.filters, engine.channels),
+             line(solution.spectra, left, engine.channels, own), beyond(engine, solution)]
+    least = engine.alpha / len(tests)
+    return sorted((test for test in tests if test and test.probability < least),
+                  key=lambda test: test.probability)

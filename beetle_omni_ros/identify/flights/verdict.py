@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +12,6 @@ from beetle_omni_ros.identify.flights.bag_flight import BagFlight
 from beetle_omni_ros.identify.flights.balance import Balance, SLOW
 from beetle_omni_ros.identify.flights.body import BodyModel, tilting_modules
 from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.evidence import Solution
 from beetle_omni_ros.identify.flights.keys import (
     all_keys,
     entries_of,
@@ -33,7 +32,14 @@ from beetle_omni_ros.identify.flights.keys import (
     VARYING,
     VERTICAL,
 )
-from beetle_omni_ros.identify.flights.results import ALPHA, concluded, result_of, Starts
+from beetle_omni_ros.identify.flights.results import (
+    ALPHA,
+    concluded,
+    result_of,
+    Starts,
+    Then,
+    Weighed,
+)
 from beetle_omni_ros.identify.flights.servo import starts_of
 from beetle_omni_ros.identify.flights.signals import IMU_LAG
 from beetle_omni_ros.identify.flights.table_flight import (
@@ -56,23 +62,27 @@ LATE = 0.0, 0.012, 0.024     # [s] latencies of commands, as apart as a linear d
 BAG_GROUPS = {group: {'used': True, 'channels': [c for c in BagFlight.channels
                                                  if c.startswith(group)]}
               for group in ('force', 'torque', 'acceleration', 'rate', 'joint')}
-# Entries of each group of channels. Those of the torques also need the forces.
-FORCES = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_drag',
-          'axial_inflow', 'translational_lift', 'wind', 'wind_velocity', 'voltage_sag',
-          'rotor_lag', 'rotor_dead_time', 'command_latency', 'imu_accelerometer_bias',
-          'imu_misalignment', 'imu_lever_arm', 'formula')
 HUB = 'rotor_hub_moment'
 TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coefficient', HUB,
            'propeller_gyroscopic_torque', 'rotor_acceleration_torque')
+LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
+IMU = 'imu_accelerometer_bias', 'imu_misalignment', 'imu_lever_arm'
+# Entries of tables that are not of torques.
+OTHERS = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_drag',
+          'axial_inflow', 'translational_lift', 'wind', 'wind_velocity', 'voltage_sag',
+          'formula', *LAGS, *IMU, 'imu_gyroscope_bias', 'mocap_misalignment')
+# What shows entries of tables: begins of names of signals and channels, one of which is there.
+SHOWN_BY = (
+    (('torque_',), TORQUES), (('voltage',), ('voltage_sag',)),
+    (('acceleration_', 'rate_'), ('imu_gyroscope_bias', 'mocap_misalignment')),
+    (('angular_velocity',), ('imu_lever_arm',)), (('position',), ('ground_effect',)),
+    (('position', 'velocity'), ('rotor_drag', 'body_drag', 'axial_inflow', 'translational_lift',
+                                HUB)),
+    (('force_x',), ('imu_misalignment', 'wind', 'wind_velocity', 'rotor_drag', 'body_drag')))
 FEEDBACK = ('the commands explain too little of the angular acceleration: a controller that feeds '
             'back what the model lacks would be taken for the robot')
 BALANCED = 'they show the hub moment alone, which the commands balance'
 WEIGHED = 'mass', 'inertia'
-LAGS = ('rotor_lag', 'rotor_dead_time', 'command_latency')
-IMU = 'imu_accelerometer_bias', 'imu_misalignment', 'imu_lever_arm'
-# Entries of the comparison of IMU and MoCap.
-SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
-Then = Callable[[Engine, Solution, dict, Starts | None, list], dict]   # adds; last: judges
 
 
 def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: RobotParameters,
@@ -121,9 +131,8 @@ def judged(flights: Sequence[Recording], judging: Sequence[Recording], robot: Ro
     for model in others:
         model.settle(dict(zip(engine.names, engine.point_of(solution, solution.theta)[
             :engine.real], strict=False)))
-    result = concluded(engine, solution, keys, others or models, BAG_GROUPS, starts=starts,
-                       held_out=bool(judging))
-    return result | then(engine, solution, result, starts, others or models) if then else result
+    return concluded(Weighed(engine, solution, keys, starts), others or models, BAG_GROUPS,
+                     held_out=bool(judging), then=then)
 
 
 def _priors(robot, keys, tolerance, stamps=0.0):
@@ -181,40 +190,25 @@ def _delays(robot, p, coarse):
 
     Beyond a limit, a deviation is a finding. ``coarse`` sensors are also late.
     """
-    bus, imu = (-p.command_delay, p.bus_late), p.coarse_imu if coarse else p.imu_averaging
+    bus, imu = (p.bus_near, (-p.command_delay, p.bus_late)), \
+        p.coarse_imu if coarse else p.imu_averaging
     stamps = 2 * p.tolerance_delay      # a reading of the latest IMU may be as much later
     # A module can swing with the joint: its inertia over the servo's, as a logarithm.
     swing = float(np.log(max(tilting_modules(robot)[0] / robot.joints.inertia, 1.0)))
-    deviations = {TILT_BUS: p.bus_near, THRUST_BUS: p.bus_near, IMU_LAG: imu,
-                  SWING: p.tolerance_swing + swing}
-    limits = {TILT_BUS: bus, THRUST_BUS: bus, IMU_LAG: (0.0, imu + stamps),
-              SWING: (-p.tolerance_swing, swing + p.tolerance_swing)}
+    delays = {TILT_BUS: bus, THRUST_BUS: bus, IMU_LAG: (imu, (0.0, imu + stamps)), SWING: (
+        p.tolerance_swing + swing, (-p.tolerance_swing, swing + p.tolerance_swing))}
     if coarse:
-        deviations['joint_feedback_delay.delay'] = p.coarse_encoders
-        limits['joint_feedback_delay.delay'] = 0.0, p.coarse_encoders
-    return deviations, limits
+        delays['joint_feedback_delay.delay'] = p.coarse_encoders, (0.0, p.coarse_encoders)
+    return [{name: own[k] for name, own in delays.items()} for k in range(2)]
 
 
 def _engine(flights, robot, p, declared, alpha, torques=TORQUES):
     """Engine of flights of tables with the entries that channels and signals can show."""
-    channels, signals, names = flights[0].channels, set(declared.signals), set(FORCES)
-    if any(name.startswith('torque') for name in channels):
-        names |= set(torques)
-    if any(name.startswith(COMPARED) for name in channels):
-        names |= set(SENSORS)
-    if by_mocap(signals):
+    there = *flights[0].channels, *declared.signals
+    names = {*OTHERS, *torques}.difference(*(hidden for needed, hidden in SHOWN_BY if not any(
+        name.startswith(needed) for name in there)))
+    if by_mocap(declared.signals):
         names = names - {*IMU} | {'mocap_misalignment'}
-    if 'angular_velocity' not in signals:
-        names -= {'imu_lever_arm'}
-    if 'position' not in signals:
-        names -= {'ground_effect'}
-    if not {'position', 'velocity'} & signals:
-        names -= {'rotor_drag', 'body_drag', 'axial_inflow', 'translational_lift',
-                  'rotor_hub_moment'}
-    if 'voltage' not in signals:
-        names -= {'voltage_sag'}
-    if 'force_x' not in channels:
-        names -= {'imu_misalignment', 'wind', 'wind_velocity', 'rotor_drag', 'body_drag'}
     keys = keys_of(robot, names - set(p.without))
     priors, entries, bounds, far = _priors(robot, keys, tolerances(p), declared.clock_deviation)
     far -= set(VERTICAL)
@@ -244,7 +238,7 @@ def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
     """
     if not {'duty', 'thrust'} & set(declared.signals):
         raise ParameterError(f"--format {declared.name}: expected the key 'duty' or 'thrust'")
-    keys = keys_of(robot, {*FORCES, *TORQUES, *SENSORS})
+    keys = keys_of(robot, {*OTHERS, *TORQUES})
     body = BodyModel(robot, {**all_keys(robot), **extra_keys(robot)}, tilting_modules(robot))
     return [TableFlight(table, robot, body, keys) for table in read_tables(paths, declared)]
 
@@ -293,23 +287,17 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
     if slow:
         groups['torque'] = {'used': True, 'channels': ['torque_x', 'torque_y'],
                             'reason': 'no gyroscope: means of 2 s, by the attitude'}
-    result = concluded(engine, solution, keys, judges, groups, held_out=bool(judging),
-                       findings=findings, slow=Balance(slow, robot) if slow else None,
-                       measured=not estimated(declared))
-    return result | then(engine, solution, result, None, judges) if then else result
+    return concluded(Weighed(engine, solution, keys), judges, groups, bool(judging), findings,
+                     Balance(slow, robot) if slow else None, not estimated(declared), then)
 
 
 def _groups(flight, declared):
     """Each group of channels: whether it is used, and why not."""
-    groups = {}
-    for group in GROUPS:
-        own = {c: why for c, why in flight.reasons.items() if c.startswith(group)}
-        used = [c for c, why in own.items() if not why]
-        unused = sorted({why for why in own.values() if why})
-        groups[group] = {'used': bool(used), 'channels': used,
-                         **({'reason': '; '.join(unused)} if unused else {})}
-    signals = declared.signals
-    groups['joint'] = {'used': False, 'channels': [],
-                       'reason': 'not compared for tables' if 'tilt' in signals
-                       else 'the rotors do not tilt'}
+    reasons, groups = flight.reasons | {'joint': 'not compared for tables' if (
+        'tilt' in declared.signals) else 'the rotors do not tilt'}, {}
+    for group in (*GROUPS, 'joint'):
+        own = {c: why for c, why in reasons.items() if c.startswith(group)}
+        used, unused = [c for c, why in own.items() if not why], sorted({*own.values()} - {''})
+        groups[group] = {'used': bool(used), 'channels': used} | (
+            {'reason': '; '.join(unused)} if unused else {})
     return groups

@@ -149,9 +149,9 @@ def _effects(search, robot):
     result = []
     for name in sorted(search.chosen.entries, key=lambda name: -search.gains[name]):
         rivals = _rivals(search, name)
-        effect = {'names': [name, *rivals], 'layer': 'joint', 'evidence': _evidence(search, name)}
+        effect = {'names': [name, *rivals], 'evidence': _evidence(search, name)}
         if rivals:
-            effect['rivals'] = [{'name': rival, 'gain': search.gains.get(rival, 0.0),
+            effect['rivals'] = [{'name': rival,
                                  'evidence': _evidence(search, rival),
                                  'parameters': _parameters(search, search.trials[rival], rival,
                                                            robot)} for rival in rivals]
