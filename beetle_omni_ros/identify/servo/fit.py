@@ -356,13 +356,10 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
     return Search(servos, full, chosen, trials, gains)
 
 
-def error_rms(log: JointLog, joint: int, values: np.ndarray, held: bool = True,
-              part: slice = slice(None)) -> float:
-    """RMS [rad] of prediction minus reading at fresh rows of the joint with this index."""
-    rows = np.arange(len(log.t))[part]
-    rows = rows[log.fresh[rows]]
-    error = simulate(log, joint, values[None], held)[0] - log.measured[joint]
-    return rms(error[rows])
+def error_rms(log: JointLog, joint: int, predicted: np.ndarray, part: slice = slice(None)
+              ) -> float:
+    """RMS [rad] of a prediction (N,) minus the fresh readings of the joint with this index."""
+    return rms((predicted - log.measured[joint])[part][log.fresh[part]])
 
 
 def rms(values: np.ndarray) -> float:
