@@ -118,10 +118,9 @@ def left_out_rms(search: Search, unit: int) -> tuple[float, float]:
     """RMS errors [rad] of servo and line at kinds of motion that their fits leave out."""
     s, fit, (k, joint, _) = search.servos, search.chosen.fit, search.servos.units[unit]
     log, block, rows = s.logs[k], s.blocks[unit], s.rows[k]
-    mine = np.array(s.labels['log']) == k
-    read, slopes = s.readings(k, fit.theta[mine], mask(search.chosen.entries))
+    errors, slopes = s.errors(k, fit.theta, mask(search.chosen.entries))
     moved = slopes[:, joint].T @ fit.s[unit] @ fit.deviations.T
-    servo = read[joint] - log.measured[joint, rows] + moved[np.arange(len(rows)), block]
+    servo = errors[joint] + moved[np.arange(len(rows)), block]
     line = [(fitted_line(log, joint, rows[block != b]).at(log, joint)
              - log.measured[joint])[rows[block == b]] for b in np.unique(block)]
     return rms(servo), rms(np.concatenate(line))
