@@ -61,7 +61,7 @@ def run_identify(what: str, paths: Sequence[Path], *, validate: Sequence[Path] =
     if rotors:
         model = of_rotor.identify_rotor(rotors)
         results['rotor'] = of_rotor.rotor_results(model)
-        found[:0] = of_rotor.measured(results['rotor'])
+        found = [*of_rotor.measured(results['rotor']), *found]      # in the order of a file
         tables += of_rotor.grids(results['rotor'])
         sections += of_rotor.sections(model, parameters) if report else []
         texts += [] if whole else [f'verdict: {results["rotor"]["verdict"]}', *(

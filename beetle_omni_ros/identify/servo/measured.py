@@ -87,15 +87,13 @@ def _drawn(search: Search, trial: ServoModel, log: int | None, robot: RobotParam
     if draws > 1:
         factor = np.linalg.cholesky(fit.covariance() + 1e-12 * np.eye(len(fit.x)))
         x = x + factor @ np.random.default_rng(0).normal(size=(len(fit.x), draws))
-    logs, numbers = np.array([(k, number) for k, _, number in search.servos.units]).T
-    there = np.unique(numbers)
-    sets = []
-    for number in there:
-        units = np.flatnonzero((numbers == number) & (logs == log))
-        units = units if len(units) else np.flatnonzero(numbers == number)
-        sets.append(base[units[0]][:, None] + fit.s[units].mean(axis=0) @ x)
-    values = catalogue_values(
-        decoded(np.clip(np.array(sets), LOW[:, None], HIGH[:, None]).transpose(2, 0, 1)).T, robot)
+    sets = {}
+    for number in sorted({number for *_, number in search.servos.units}):
+        every = [u for u, (*_, own) in enumerate(search.servos.units) if own == number]
+        units = [u for u in every if search.servos.units[u][0] == log] or every
+        sets[number - 1] = base[units[0]][:, None] + fit.s[units].mean(axis=0) @ x
+    bounded = np.clip(list(sets.values()), LOW[:, None], HIGH[:, None])
+    values = catalogue_values(decoded(bounded.transpose(2, 0, 1)).T, robot)
     result = {}
     for entry in trial.entries:
         for name, given in values.get(entry, {}).items() if entry != 'joint_offset' else ():
@@ -107,6 +105,6 @@ def _drawn(search: Search, trial: ServoModel, log: int | None, robot: RobotParam
                 value = value.mean(axis=0, keepdims=True)
             else:
                 known, value = value, np.tile(np.median(value, axis=0), (JOINTS, 1))
-                value[there - 1] = known
+                value[list(sets)] = known
             result[key] = value
     return result
