@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros.bags.bag import BagError, read_bag, read_messages
-from beetle_omni_ros.identify.recording.series import held_at, integral
+from beetle_omni_ros.identify.recording.series import held_at, integral, runs
 from beetle_omni_ros.model.files import LogError, missing, read_table
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
@@ -294,13 +294,12 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     t, position = log.joint.t[fresh], log.joint.position[fresh]
     last = np.searchsorted(received, t, side='right') - 1
     driven = (last >= 0) & (t - received[np.maximum(last, 0)] <= LAST_COMMAND)
-    edges = np.flatnonzero(np.diff(np.r_[False, driven, False].astype(int)))
-    stretches = edges.reshape(-1, 2)
-    if not len(stretches):
+    stretches = runs(driven)
+    if not stretches:
         raise LogError(f'{path}: no joint_states during the commands; expected stamps of both by '
                        'one clock')
-    first, end = stretches[np.argmax(stretches[:, 1] - stretches[:, 0])]
-    first, end = _most_motion(t, tilt[last], first, end)
+    first, length = max(stretches, key=lambda stretch: stretch[1])
+    first, end = _most_motion(t, tilt[last], first, first + length)
     chosen = slice(first, end)
     return t[chosen] - t[first], position[chosen].T, tilt[last[chosen]].T
 
