@@ -147,11 +147,8 @@ def _effects(search, robot):
         rivals = _rivals(search, name)
         effect = {'names': [name, *rivals], 'layer': 'joint', 'evidence': _evidence(search, name)}
         if rivals:
-            effect['rivals'] = [
-                {'name': rival, 'gain': search.gains.get(rival, 0.0),
-                 'evidence': _evidence(search, rival),
-                 'parameters': _of_all(search, search.trials[rival], rival, robot)}
-                for rival in rivals]
+            effect['rivals'] = [{'name': rival, 'parameters': _of_all(
+                search, search.trials[rival], rival, robot)} for rival in rivals]
         if CATALOGUE[name].each != 'joint':
             result.append(effect | {'parameters': _of_all(search, search.chosen, name, robot)})
             continue
