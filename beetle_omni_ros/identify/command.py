@@ -93,20 +93,10 @@ def run_identify(what: str, paths: Sequence[Path], *, validate: Sequence[Path] =
 def read_logs(what: str, paths: Sequence[Path], columns: Mapping[str, tuple[str, float]],
               rate: float | None) -> tuple[list, list, list[str]]:
     """
-    Read logs of joints and of rotors.
+    Logs of joints, logs of rotors, and sentences about logs that were left out.
 
-    Args:
-        what: `joint` or `rotor`, the kind of all logs, or `robot`: the header decides.
-        paths: CSV files, or bags with responses of the joints.
-        columns: of rotors, see :func:`chosen`.
-        rate: rows a second of time series without times [Hz]; None: `robot` leaves them out.
-
-    Returns:
-        logs of joints, logs of rotors, and sentences about logs that were left out.
-
-    Raises:
-        LogError: an unusable log, or one of neither kind.
-
+    If all kinds are expected (`robot`), the header decides, and time series without times are left
+    out unless ``rate`` is given.
     """
     joints, rotors, notes = [], [], []
     for path in paths:

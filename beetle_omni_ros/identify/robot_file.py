@@ -30,23 +30,13 @@ MEASURED = """\
 
 @dataclass(frozen=True)
 class Measured:
-    """
-    A key of a robot file, as logs show it.
+    """A key of a robot file, as logs show it."""
 
-    Attributes:
-        key: dotted key.
-        value: its value; None: it is not written.
-        interval: 95 % interval; None: unknown.
-        logs: names of the logs that show it.
-        how: what value and interval are; empty: a constant.
-
-    """
-
-    key: str
-    value: Any
-    interval: Any
-    logs: Sequence[str]
-    how: str
+    key: str                # dotted
+    value: Any              # None: it is not written
+    interval: Any           # of 95 %; None: unknown
+    logs: Sequence[str]     # names of the logs that show it
+    how: str                # what value and interval are; empty: a constant
 
 
 class _Plain(yaml.SafeDumper):
@@ -104,20 +94,13 @@ def rounded(value: Any, digits: int = 5) -> Any:
 def write_measured(path: Path, robot: RobotParameters, base: Path | None, logs: Sequence[Path],
                    found: Sequence[Measured]) -> dict:
     """
-    Write a robot file that extends ``base`` by measured values.
-
-    Args:
-        path: output file.
-        robot: robot of ``base``.
-        base: extended file; None: the shipped one.
-        logs: files of the logs.
-        found: keys of rotors and effects.
+    Write a robot file that extends ``base``, whose robot is given, by what ``logs`` show.
 
     Returns:
         Content of the file.
 
     Raises:
-        LogError: the logs show nothing for it.
+        LogError: they show nothing.
         ParameterError: the file cannot be written.
 
     """

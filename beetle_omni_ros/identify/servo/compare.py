@@ -147,14 +147,15 @@ def _effects(search, robot):
         rivals = _rivals(search, name)
         effect = {'names': [name, *rivals], 'layer': 'joint', 'evidence': _evidence(search, name)}
         if rivals:
-            effect['rivals'] = [{'name': rival, 'parameters': _of_all(
-                search, search.trials[rival], rival, robot)} for rival in rivals]
+            effect['rivals'] = [{'name': rival, 'parameters': _of_all(rival, _estimates(
+                search, search.trials[rival], rival, robot))} for rival in rivals]
+        of_units = _estimates(search, search.chosen, name, robot)
         if CATALOGUE[name].each != 'joint':
-            result.append(effect | {'parameters': _of_all(search, search.chosen, name, robot)})
+            result.append(effect | {'parameters': _of_all(name, of_units)})
             continue
         moved = s.visible(search.chosen, search.trials[name]) & s.changed(search.chosen, name)
-        result += [effect | {'joint': s.units[unit][2], 'parameters': _of_unit(
-            search, search.chosen, name, robot, unit)} for unit in np.flatnonzero(moved)]
+        result += [effect | {'joint': number, 'parameters': of_units[number]}
+                   for (*_, number), seen in zip(s.units, moved, strict=True) if seen]
     return result
 
 
@@ -172,30 +173,14 @@ def _rivals(search, name):
     return sorted(rivals, key=lambda other: -rivals[other])
 
 
-def _of_all(search, trial, name, robot):
-    """As :func:`_of_unit`, of the median joint, with the value of each joint."""
-    every = [_of_unit(search, trial, name, robot, u) for u in range(len(search.servos.units))]
-    joined = {}
-    for parameter, spec in CATALOGUE[name].parameters.items():
-        own = [one[parameter] for one in every]
-        value, file, (low, high) = (np.median([one[key] for one in own], axis=0)
-                                    for key in ('value', 'file', 'interval'))
-        joined[parameter] = {
-            'value': float(value), 'unit': spec.unit, 'file': float(file),
-            'interval': [max(float(low), spec.low), float(high)],
-            'each': {str(number): one['value']
-                     for (*_, number), one in zip(search.servos.units, own, strict=True)}}
-    return joined
-
-
-def _of_unit(search, trial, name, robot, unit):
+def _estimates(search, trial, name, robot):
     """
-    Parameters of an entry for one joint, by name.
+    Number of a joint -> parameters of an entry by name.
 
     Value, unit, 95 % interval, value of the file, and the one that a corrected file has. An entry
     that the log neither needs nor excludes widens the intervals of the others.
     """
-    s, spec = search.servos, CATALOGUE[name].parameters
+    s, spec, file = search.servos, CATALOGUE[name].parameters, file_sets(robot, flown=True)
     possible = [trial, *(search.trials[other] for other, gain in search.gains.items()
                          if trial is search.chosen and other not in trial.entries
                          and gain > -CERTAIN)]
@@ -204,16 +189,35 @@ def _of_unit(search, trial, name, robot, unit):
         found = catalogue_values(values, robot)[name]
         return np.array([found[parameter] for parameter in spec])
 
-    def reported(values):
-        return written(values) - (_constant(s, unit, values) if name == 'joint_offset' else 0.0)
+    result = {}
+    for unit, (*_, number) in enumerate(s.units):
+        def reported(values, unit=unit):
+            zero = _constant(s, unit, values) if name == 'joint_offset' else 0.0
+            return written(values) - zero
 
-    value, error = np.array([_derived(one, unit, reported) for one in possible]).swapaxes(0, 1)
-    ends = (value - WIDTH * error).min(axis=0), (value + WIDTH * error).max(axis=0)
-    file = file_sets(robot, flown=True)[s.units[unit][2] - 1]
-    return {parameter: {'value': here, 'unit': spec[parameter].unit, 'interval': [low, high],
-                        'file': in_file, 'written': new}
-            for parameter, here, low, high, in_file, new in zip(spec, *(one.tolist() for one in (
-                value[0], *ends, reported(file), written(search.values()[unit]))), strict=True)}
+        value, error = np.swapaxes([_derived(one, unit, reported) for one in possible], 0, 1)
+        low, high = (value - WIDTH * error).min(axis=0), (value + WIDTH * error).max(axis=0)
+        result[number] = {
+            parameter: {'value': here, 'unit': spec[parameter].unit, 'interval': list(ends),
+                        'file': known, 'written': new}
+            for parameter, here, *ends, known, new in zip(spec, *(column.tolist() for column in (
+                value[0], low, high, reported(file[number - 1]),
+                written(search.values()[unit]))), strict=True)}
+    return result
+
+
+def _of_all(name, of_units):
+    """The median joint of :func:`_estimates`, with the value of each joint."""
+    joined = {}
+    for parameter, spec in CATALOGUE[name].parameters.items():
+        own = {str(number): one[parameter] for number, one in of_units.items()}
+        value, file, (low, high) = (
+            np.median([one[key] for one in own.values()], axis=0).tolist()
+            for key in ('value', 'file', 'interval'))
+        joined[parameter] = {'value': value, 'unit': spec.unit, 'file': file,
+                             'interval': [max(low, spec.low), high],
+                             'each': {number: one['value'] for number, one in own.items()}}
+    return joined
 
 
 def _constant(servos, unit, values):

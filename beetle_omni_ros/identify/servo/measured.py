@@ -1,12 +1,19 @@
 """What a robot file states of identified servos."""
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
 
 from beetle_omni_ros.identify.robot_file import Measured, rounded
 from beetle_omni_ros.identify.servo.fit import decoded, HIGH, LOW, Search, ServoModel, STARTS
-from beetle_omni_ros.identify.servo.model import catalogue_values, INDEX, JOINTS, own_delay
+from beetle_omni_ros.identify.servo.model import (
+    catalogue_values,
+    INDEX,
+    JOINTS,
+    NAMES,
+    own_delay,
+)
 from beetle_omni_ros.model.effects import CATALOGUE
 from beetle_omni_ros.model.parameters import RobotParameters, TILT_LAG
 
@@ -65,13 +72,11 @@ def _interval(value, draws):
 
 def _with_other_gains(search):
     """The selected model with gains that differ between logs."""
-    servos, spreads = search.servos, search.servos.spreads
-    servos.spreads = list(spreads)
-    for p in (INDEX[name] for name in GAINS):
-        servos.spreads[p] = replace(spreads[p], groups=spreads[p].groups | {'log': BETWEEN})
-    apart = servos.fit(search.chosen.entries, starts=(search.chosen, *STARTS))
-    servos.spreads = spreads
-    return apart
+    servos = copy(search.servos)
+    servos.spreads = [replace(spread, groups=spread.groups | {'log': BETWEEN})
+                      if name in GAINS else spread
+                      for name, spread in zip(NAMES, servos.spreads, strict=True)]
+    return servos.fit(search.chosen.entries, starts=(search.chosen, *STARTS))
 
 
 def _drawn(search: Search, trial: ServoModel, log: int | None, robot: RobotParameters, draws: int

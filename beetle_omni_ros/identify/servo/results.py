@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import matplotlib
 from matplotlib.figure import Figure
@@ -85,33 +84,26 @@ def interval(search: Search, trial: ServoModel, unit: int, name: str) -> tuple[f
     return max(float(low), TERMS[name].low), min(float(high), TERMS[name].high)
 
 
-@dataclass(frozen=True)
-class Line:
+def fitted_line(log: JointLog, joint: int, rows: np.ndarray) -> tuple[float, float, float]:
     """
-    Readings = slope command(t - delay) + offset of a joint.
+    Delay, slope and offset of readings = slope command(t - delay) + offset at rows of a joint.
 
     The competitor of the servo model: 3 numbers without friction and bandwidth.
     """
-
-    delay: float
-    slope: float
-    offset: float
-
-    def at(self, log: JointLog, joint: int) -> np.ndarray:
-        """Predictions (N,) [rad]; nan in rows without a reading."""
-        return self.slope * log.command_at(joint, log.read_t - self.delay) + self.offset
-
-
-def fitted_line(log: JointLog, joint: int, rows: np.ndarray) -> Line:
-    """The line with the least error at rows of a joint."""
     read, size = log.measured[joint, rows], np.inf
     for delay in DELAYS:
         late = np.stack([log.command_at(joint, log.read_t[rows] - delay), np.ones(len(rows))])
         slope, offset = np.linalg.lstsq(late.T, read, rcond=None)[0]
         error = np.mean((slope * late[0] + offset - read)**2)
         if error < size:
-            size, best = error, Line(float(delay), float(slope), float(offset))
+            size, best = error, (float(delay), float(slope), float(offset))
     return best
+
+
+def line_at(line: tuple[float, float, float], log: JointLog, joint: int) -> np.ndarray:
+    """Predictions (N,) of a line [rad]; nan in rows without a reading."""
+    delay, slope, offset = line
+    return slope * log.command_at(joint, log.read_t - delay) + offset
 
 
 def left_out_rms(search: Search, unit: int) -> tuple[float, float]:
@@ -121,7 +113,7 @@ def left_out_rms(search: Search, unit: int) -> tuple[float, float]:
     errors, slopes = s.errors(k, fit.theta, mask(search.chosen.entries))
     moved = slopes[:, joint].T @ fit.s[unit] @ fit.deviations.T
     servo = errors[joint] + moved[np.arange(len(rows)), block]
-    line = [(fitted_line(log, joint, rows[block != b]).at(log, joint)
+    line = [(line_at(fitted_line(log, joint, rows[block != b]), log, joint)
              - log.measured[joint])[rows[block == b]] for b in np.unique(block)]
     return rms(servo), rms(np.concatenate(line))
 
@@ -158,13 +150,14 @@ def _joint(search, unit, validations, robot):
                             for other, k in known]}
 
     of = {'file': errors(lambda log, k: simulate(log, k, file, is_held)[0]),
-          'servo': errors(lambda log, k: simulate(log, k, values)[0]), 'line': errors(line.at)}
+          'servo': errors(lambda log, k: simulate(log, k, values)[0]),
+          'line': errors(lambda log, k: line_at(line, log, k))}
     best = 'servo' if apart[0] <= apart[1] else 'line'
     of['best'], traded = of[best], inseparable(search, unit)
     return {
         'joint': number, 'best': best,
         'left_out_rms_rad': dict(zip(('servo', 'line'), apart, strict=True)),
-        'line': {'gain': line.slope - 1, 'offset_rad': line.offset, 'delay_s': line.delay,
+        'line': {'gain': line[1] - 1, 'offset_rad': line[2], 'delay_s': line[0],
                  'heldout_rms_rad': of['line']['held out']},
         'holds_for': log.first().motion(index),
         **{key: of[model][part] for key, (_, model, part) in ERRORS.items()},
