@@ -1,5 +1,6 @@
 """`beetle_omni identify` from the command line."""
 
+from dataclasses import replace
 import json
 
 import numpy as np
@@ -45,6 +46,20 @@ def test_joint_writes_all_its_files(logs, tmp_path, capsys):
     written = RobotParameters.load(params).joints
     assert written.natural_frequency == pytest.approx(
         np.median([joint['terms']['natural_frequency']['value'] for joint in joints]), rel=0.05)
+
+
+def test_logs_of_different_joints_make_one_file(logs, tmp_path, capsys):
+    first, page, params = logs[2], tmp_path / 'r.html', tmp_path / 'robot.yaml'
+    made = log_of(*sweep(3.0, periods=(0.4, 0.6), amplitudes=(0.3, 0.5)), SERVOS[1:], seed=4)
+    third = write(tmp_path / 'third.csv', replace(made, joints=(3,)))
+    assert cli.main([str(a) for a in ('identify', 'robot', first, third, '--params', params)]) == 0
+    assert 'joint 3' in capsys.readouterr().out
+    bands = RobotParameters.load(params).effects['joint_friction']['coulomb']
+    assert bands[2] > 1.3 * bands[0] and bands[1] == bands[3] == pytest.approx(
+        (bands[0] + bands[2]) / 2, rel=1e-3)
+    assert cli.main([str(a) for a in ('identify', 'joint', first, '--validate', third,
+                                      '--report', page)]) == 0
+    assert 'absent' in capsys.readouterr().out and page.read_text().count('<img') == 1
 
 
 def test_rotor_writes_all_its_files(tmp_path, capsys):

@@ -10,11 +10,10 @@ from servo_logs import log_of, servo, sweep, write
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.identify.flights.apply import effects_with
-from beetle_omni_ros.identify.servo import results
 from beetle_omni_ros.identify.servo.compare import compare, gap_of
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import file_sets, own_delay, simulate
-from beetle_omni_ros.identify.servo.results import fitted_line, identify, joint_results
+from beetle_omni_ros.identify.servo.results import fitted_line, identify, joint_results, line_at
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.servo import play
 
@@ -212,6 +211,6 @@ def test_real_servos_of_one_log_predict_the_others_better_than_a_line(real):
     servo = [joint['validation_rms_rad']
              for joint in joint_results(apart, others, SHIPPED)['joints']]
     fitted = [fitted_line(log, k, apart.servos.rows[0]) for k in range(len(servo))]
-    lines = [[np.mean(results.line_errors(line, other, k, np.flatnonzero(other.fresh))**2)
-              for other in others] for k, line in enumerate(fitted)]
+    lines = [[np.nanmean((line_at(line, other, k) - other.measured[k])**2) for other in others]
+             for k, line in enumerate(fitted)]
     assert (np.mean(np.square(servo), axis=0) < np.mean(lines, axis=0)).all()

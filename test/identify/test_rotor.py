@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from rotor_logs import bench, HEADER, PACKS, RATIO, SERIES, series, stand, SURFACE, write
 
-from beetle_omni_ros.identify.command import rotor_values, write_measured
 from beetle_omni_ros.identify.inference.noise import interval
+from beetle_omni_ros.identify.robot_file import write_measured
 from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
-from beetle_omni_ros.identify.rotor.results import identify_rotor, rotor_results
+from beetle_omni_ros.identify.rotor.results import identify_rotor, measured, rotor_results
 from beetle_omni_ros.model.files import LogError
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.parts import ThrustMap
@@ -29,8 +29,7 @@ def thrust_of(model, duty, voltage):
 
 
 def written(folder, results):
-    write_measured(folder / 'robot.yaml', RobotParameters.load(), None, [], None,
-                   rotor_values(results))
+    write_measured(folder / 'robot.yaml', RobotParameters.load(), None, [], measured(results))
 
 
 def only_lag(model):

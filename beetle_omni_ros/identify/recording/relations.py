@@ -15,6 +15,7 @@ from scipy.linalg import block_diag
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from beetle_omni_ros.identify.inference.noise import SIGMA_OF_MEDIAN
 from beetle_omni_ros.identify.recording.bag import COMMAND, IMU, JOINTS, POSE, Recording
 from beetle_omni_ros.identify.recording.parameters import shipped
 from beetle_omni_ros.identify.recording.series import aligned, low_pass, matrices
@@ -137,7 +138,7 @@ def white_noise(values: np.ndarray) -> np.ndarray:
     The third difference removes smooth motion. Its variance is 1 + 9 + 9 + 1 times that of white
     noise, and its median absolute deviation is robust against single steps.
     """
-    return 1.4826 / 20**0.5 * np.median(np.abs(np.diff(values, 3, axis=0)), axis=0)
+    return SIGMA_OF_MEDIAN / 20**0.5 * np.median(np.abs(np.diff(values, 3, axis=0)), axis=0)
 
 
 @dataclass(frozen=True)

@@ -95,6 +95,12 @@ def spread(t, values):
     return t[keep], values[keep]
 
 
+def runs(mask):
+    """(first index, length) of each run of True in a mask (N,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [(int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
 def bridged(t, values):
     """Samples with linear interpolation across gaps, where a spline would overshoot."""
     usual = np.median(np.diff(t))

@@ -8,6 +8,7 @@ which may be out of range, step or drift.
 """
 
 from collections.abc import Container
+from functools import partial
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -24,7 +25,7 @@ from beetle_omni_ros.identify.recording.bag import (
 )
 from beetle_omni_ros.identify.recording.parameters import shipped
 from beetle_omni_ros.identify.recording.relations import Relation, series_of, Smoothed, white_noise
-from beetle_omni_ros.identify.recording.series import matrices
+from beetle_omni_ros.identify.recording.series import matrices, runs
 
 OVERLAP = 6     # windows that share a sample; a motion counts once
 NEIGHBOURS = 7          # readings of a running median
@@ -45,36 +46,41 @@ def begin_of(recording: Recording) -> float:
 def clock_damages(recording: Recording) -> list[Damage]:
     """Damages by stamps alone, at most one for each topic."""
     ages = relative_ages(recording)
-    found = (_advance(recording, topic) or _age(recording, topic, ages)
-             or _order(recording, topic) for topic in NEEDED)
+    found = (_clock_damage(recording, topic, *ages.get(topic, ((), ()))) for topic in NEEDED)
     return [damage for damage in found if damage]
 
 
-def _advance(recording, topic):
-    """Stamps that do not advance, or are in another unit."""
-    steps, (low, high) = np.diff(recording.times[topic]), shipped().period
+def _clock_damage(recording, topic, at, ages):
+    """Stamps that do not advance, in another unit, of another clock, back, or of two sources."""
+    limits, t, damage = shipped(), recording.times[topic], partial(Damage, recording.name, topic)
+    steps, (low, high) = np.diff(t), limits.period
     ahead = steps[steps > 0]
-    if len(ahead) < shipped().few * len(steps):
-        return Damage(recording.name, topic, f'{len(steps) - len(ahead)} of {len(steps)} stamps '
-                      f'do not advance (first stamp {recording.times[topic][0]:.3f} s)')
-    period = float(np.median(ahead))
-    return None if low <= period <= high else Damage(
-        recording.name, topic, f'stamps are {period:g} s apart; expected {low:g} to {high:g} s: '
-        'another unit taken for seconds, such as milliseconds or nanoseconds?')
-
-
-def _order(recording, topic):
-    """Stamps that go back far, or occur twice with other values."""
-    t, steps = recording.times[topic], np.diff(recording.times[topic])
-    if steps.min() < -shipped().period[1]:
-        return Damage(recording.name, topic, f'the clock goes back by {-steps.min():.2f} s',
-                      t[np.argmin(steps)])
+    if len(ahead) < limits.few * len(steps):
+        return damage(f'{len(steps) - len(ahead)} of {len(steps)} stamps do not advance (first '
+                      f'stamp {t[0]:.3f} s)')
+    if not low <= (period := float(np.median(ahead))) <= high:
+        return damage(f'stamps are {period:g} s apart; expected {low:g} to {high:g} s: another '
+                      'unit taken for seconds, such as milliseconds or nanoseconds?')
+    if judged := judge(at, ages, limits.clock_offset, limits.clock_step):
+        cause, moment, late_at = judged
+        received = recording.received[topic]
+        late = late_at(received)
+        if moment is not None:      # the message at the step
+            near = np.flatnonzero(np.abs(received - moment) < 2 * limits.bin)
+            k = near[np.argmax(np.abs(np.diff((received - t)[near])))] + 1
+            moment, late = t[k], np.where(np.arange(len(t)) < k, late[0], late[-1])
+        return damage(f'the clock {cause}, against the other topics recorded at the same time: '
+                      'clocks of two computers differ, or another time base', moment,
+                      fix='shift the stamps', repair=lambda r: changed(r, topic, times=t + late))
+    if steps.min() < -high:
+        return damage(f'the clock goes back by {-steps.min():.2f} s', t[np.argmin(steps)])
     order = np.argsort(t, kind='stable')
     rows = recording.values[topic][order]
     twice = (np.diff(t[order]) <= 0) & (rows[1:] != rows[:-1]).any(axis=1)
-    return None if twice.mean() <= shipped().few else Damage(
-        recording.name, topic, f'{twice.sum()} of {len(t)} stamps occur twice with other values: '
-        'two sources publish on one topic', t[order][np.argmax(twice)])
+    if twice.mean() > limits.few:
+        return damage(f'{twice.sum()} of {len(t)} stamps occur twice with other values: two '
+                      'sources publish on one topic', t[order][np.argmax(twice)])
+    return None
 
 
 def relative_ages(recording: Recording) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -94,24 +100,6 @@ def relative_ages(recording: Recording) -> dict[str, tuple[np.ndarray, np.ndarra
         age = own - np.nanmedian([m for name, m in medians.items() if name != topic], axis=0)
         result[topic] = edges[:-1][np.isfinite(age)], age[np.isfinite(age)]
     return result
-
-
-def _age(recording, topic, ages):
-    """Offset, step or drift of a topic's clock against the times of recording."""
-    at, lags = ages.get(topic, ((), ()))
-    judged = judge(at, lags, shipped().clock_offset, shipped().clock_step)
-    if not judged:
-        return None
-    cause, moment, late_at = judged
-    t, received = recording.times[topic], recording.received[topic]
-    late = late_at(received)
-    if moment is not None:      # the message at the step
-        near = np.flatnonzero(np.abs(received - moment) < 2 * shipped().bin)
-        k = near[np.argmax(np.abs(np.diff((received - t)[near])))] + 1
-        moment, late = t[k], np.where(np.arange(len(t)) < k, late[0], late[-1])
-    return Damage(recording.name, topic, f'the clock {cause}, against the other topics recorded '
-                  'at the same time: clocks of two computers differ, or another time base', moment,
-                  fix='shift the stamps', repair=lambda r: changed(r, topic, times=t + late))
 
 
 def lag_damage(name: str, relation: Relation, signals: Smoothed) -> Damage | None:
@@ -263,24 +251,29 @@ class _Sensor:
                         f'{name} is clipped: {int(at.sum())} readings are exactly '
                         f'{values[at][0]:.4g}: the range of the sensor is too small',
                         self.t[np.argmax(at)])
-        for column, name in ((self.same, 'all axes'), *zip(same.T, self.names, strict=True)):
-            longest = self._longest(column)
-            long = [(n, k) for k, n in _runs(column) if n > longest]
-            lasting = sum(n for n, _ in long)
-            if name == 'all axes' and self.same.sum() - lasting > self.limits.stale * len(same):
+        whole = self._frozen(self.same)
+        if self.same.sum() - sum(whole.values()) > self.limits.stale * len(same):
+            return self.damage(
+                f'{self.same.mean():.0%} of the readings repeat the one before: the driver '
+                'publishes stale readings, faster than the sensor measures', None,
+                np.concatenate([[False], self.same]))
+        for name, frozen in (('all axes', whole), *zip(
+                self.names, map(self._frozen, same.T), strict=True)):
+            if frozen:
                 return self.damage(
-                    f'{column.mean():.0%} of the readings repeat the one before: the driver '
-                    'publishes stale readings, faster than the sensor measures', None,
-                    np.concatenate([[False], column]))
-            if long:
-                return self.damage(f'{name} frozen: the same reading for '
-                                   f'{lasting * np.median(np.diff(self.t)):.1f} s',
-                                   self.t[max(long)[1]])
+                    f'{name} frozen: the same reading for '
+                    f'{sum(frozen.values()) * np.median(np.diff(self.t)):.1f} s',
+                    self.t[max(frozen, key=lambda k: (frozen[k], k))])
         return None
+
+    def _frozen(self, same):
+        """First row -> length of each run of repeats that chance does not make."""
+        longest = self._longest(same)
+        return {k: n for k, n in runs(same) if n > longest}
 
     def _longest(self, same):
         """Longest run of repeats that chance makes, but for one of many recordings."""
-        share = (len(_runs(same)) - 1) / max((~same).sum(), 1)      # of readings that begin one
+        share = (len(runs(same)) - 1) / max((~same).sum(), 1)      # of readings that begin one
         share = np.clip(share, self.limits.stale, 1 - 1 / len(same))
         return np.log(len(same) / (1 - self.limits.certain)) / -np.log(share)
 
@@ -315,7 +308,7 @@ class _Sensor:
         t, commands = series_of(self.recording, COMMAND)
         low, high = self.limits.servo_lag
         for k, column in enumerate((np.diff(self.raw, axis=0) == 0).T):
-            for first, count in _runs(column):
+            for first, count in runs(column):
                 begin, end = self.t[first], self.t[first + count]
                 told = commands[(t > begin - low) & (t < end - high), k]
                 if np.ptp(told if len(told) else [0.0]) > self.limits.frozen_command:
@@ -336,9 +329,3 @@ class _Sensor:
             'a noisy sensor, a wrong calibration, or a bad view of the markers'
         return self.damage(f'{self.names[0].split(".")[0]} scatters by {scatter[k]:.2g} '
                            f'{self.unit}, and such a sensor by {self.scatter:.2g} at most: {why}')
-
-
-def _runs(mask):
-    """(first index, length) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    return [(int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

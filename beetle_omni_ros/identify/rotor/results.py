@@ -7,6 +7,7 @@ import matplotlib
 import numpy as np
 
 from beetle_omni_ros import __version__
+from beetle_omni_ros.identify.robot_file import Measured, rounded
 from beetle_omni_ros.identify.rotor.fits import (
     estimate,
     fit_lag,
@@ -93,8 +94,35 @@ def _surface(model, name):
     surface, unit = model.surfaces[name], QUANTITIES[name]
     names = ['u' + f'^{power}' * (power > 1) + ' duty' * more for power, more in surface.form]
     return {'terms': {term: estimate(surface.every[:, k]) for k, term in enumerate(names)},
-            f'rms_{unit}': surface.rms, f'left_out_rms_{unit}': surface.left_out,
-            'voltage_V': [float(end(model.rows['voltage'])) for end in (np.min, np.max)]}
+            f'rms_{unit}': surface.rms, f'left_out_rms_{unit}': surface.left_out}
+
+
+def measured(results: dict) -> list[Measured]:
+    """Keys of ``rotors`` in a robot file."""
+    found = []
+    lag, ratio, logs = (
+        results['lag'], results['torque_to_thrust_ratio'], results['meta']['log'].split(', '))
+    if ratio:
+        found.append(Measured(
+            'rotors.torque_to_thrust_ratio', rounded(ratio['value']),
+            rounded(ratio['interval'], 4), logs, 'slope of torque over thrust of settled steps'))
+        rows = results['plateaus']
+        found.append(Measured('rotors.map', [
+            {'voltage': round(row['voltage_V'], 3), 'thrust_max': round(row['thrust_max_N'], 4),
+             'coefficients': [round(row['coefficients'][f'c{k}']['value'], 8) for k in range(4)]}
+            for row in rows], None, logs, (
+            'cubics of the surface of settled steps, to the largest of their thrusts; 95 % band '
+            f'{max(row["thrust_half_width_N"] for row in rows):.2f} N, at a voltage left out '
+            f'{results["surface"]["left_out_rms_N"]:.2f} N RMS')))
+    if lag and 'value' in lag and results['verdict'] != 'bad_data':
+        shown = [one for one in lag['logs'] if 'value' in one]
+        low, high = zip(*(one['interval'] for one in shown), strict=True)
+        found.append(Measured(
+            'rotors.time_constant', rounded(lag['value'], 4), rounded([min(low), max(high)], 4),
+            [one['log'] for one in shown], f'both directions of {lag["log"]}' + (
+                ' with a gain for each window, as thrust and command do not belong together'
+                if lag['reason'] else '') + '; interval: of all these logs'))
+    return found
 
 
 def grids(results: dict) -> list[Grid]:

@@ -16,6 +16,7 @@ from beetle_omni_ros.identify.servo.fit import (
     decoded,
     error_rms,
     mask,
+    rms,
     Search,
     select,
     Servos,
@@ -28,6 +29,7 @@ from beetle_omni_ros.identify.servo.model import (
     INDEX,
     NAMES,
     own_delay,
+    simulate,
     with_encoder_errors,
 )
 from beetle_omni_ros.identify.servo.results import grids, identify, joint_results, sections
@@ -94,45 +96,39 @@ def gap_of(search: Search, apart: Search, robot: RobotParameters, **more) -> dic
         more: further keys of the results.
 
     """
-    log, units = search.servos.logs[0], range(len(search.servos.units))
-    last = slice(log.end, None)
-    numbers = [number for *_, number in search.servos.units]
-    before, after, floor = (
-        np.array([error_rms(log, u, sets[u], part=last) for u in units])
-        for sets in (file_sets(robot, flown=True)[np.array(numbers) - 1], search.values(),
-                     apart.values()))
+    s, file = search.servos, file_sets(robot, flown=True)
+    log, numbers = s.logs[0], np.array([number for *_, number in s.units])
+    before, after, floor = (np.array([
+        error_rms(log, u, simulate(log, u, one)[0], slice(log.end, None))
+        for u, one in enumerate(sets)])
+        for sets in (file[numbers - 1], search.values(), apart.values()))
     floor = np.minimum(floor, after)
     allowed = np.hypot(AS_WELL * floor, log.quantum)
-    effects = _effects(search, robot)
-    explained = bool((after <= allowed).all())
-    total = {key: float(np.sqrt(np.mean(values**2)))
-             for key, values in (('before', before), ('after', after), ('floor', floor))}
-    closure = None if total['before'] <= 1.1 * total['floor'] else float(
-        1.0 - max(total['after']**2 - total['floor']**2, 0.0)
-        / (total['before']**2 - total['floor']**2))
+    effects, explained = _effects(search, robot), bool((after <= allowed).all())
+    total_before, total_after, noise = map(rms, (before, after, floor))
     verdict = ('unknown' if not explained else 'no_gap' if not effects else
                'named_set' if any(len(e['names']) > 1 for e in effects) else 'named')
-    ratio = {key: value / total['floor'] for key, value in total.items()}
     worst = int(np.argmax(after / allowed))
-    reason = (f'error on the held-out part {1e3 * total["before"]:.1f} mrad before, '
-              f'{1e3 * total["after"]:.1f} mrad after') + ('' if explained else (
+    reason = (f'error on the held-out part {1e3 * total_before:.1f} mrad before, '
+              f'{1e3 * total_after:.1f} mrad after') + ('' if explained else (
                   f'; joint {numbers[worst]} keeps {1e3 * after[worst]:.1f} mrad, '
                   f'{1e3 * floor[worst]:.1f} mrad with every term'))
     return result_of(
-        verdict, {}, reason, closure=closure, gap_before=ratio['before'],
-        gap_after=ratio['after'], noise_floor=1.0, effects=effects if explained else [],
-        partial=[] if explained else effects, held_out=True, candidates=[
+        verdict, {}, reason, closure=None if total_before <= 1.1 * noise else
+        1.0 - max(total_after**2 - noise**2, 0.0) / (total_before**2 - noise**2),
+        gap_before=total_before / noise, gap_after=total_after / noise, noise_floor=1.0,
+        effects=effects if explained else [], partial=[] if explained else effects, held_out=True,
+        candidates=[
             {'name': name, 'accepted': name in search.chosen.entries,
              'evidence': _evidence(search, name),
              'reason': '' if name in search.chosen.entries else
              'the evidence does not need it' if search.gains[name] < CERTAIN else
              'less than an encoder count, or no better on left-out blocks'}
             for name in sorted(search.gains, key=lambda name: -search.gains[name])],
-        where=sorted(({'channel': f'joint_{number}', 'regime': 'log',
-                       'excess': float(before[u] / floor[u]),
-                       'excess_after': float(after[u] / floor[u])}
-                      for u, number in enumerate(numbers)), key=lambda row: -row['excess']),
-        **more)
+        where=sorted(({'channel': f'joint_{number}', 'regime': 'log', 'excess': float(first),
+                       'excess_after': float(then)} for number, first, then in zip(
+                           numbers, before / floor, after / floor, strict=True)),
+                     key=lambda row: -row['excess']), **more)
 
 
 def _evidence(search, name):
@@ -141,35 +137,25 @@ def _evidence(search, name):
     on, off = search.chosen.fit, search.trials[name].fit
     held = sign * (on.held - off.held)
     return {'ln_bayes_factor': search.gains[name], 'delta_bic': 2 * search.gains[name],
-            'cv_gain': 2 * float(held.sum()), 'blocks_positive': int((held > 0).sum())}
+            'cv_gain': 2 * float(held.sum())}
 
 
 def _effects(search, robot):
     """Accepted entries, largest gain first; a zero is an effect of each joint that it moves."""
-    result = []
+    result, s = [], search.servos
     for name in sorted(search.chosen.entries, key=lambda name: -search.gains[name]):
         rivals = _rivals(search, name)
         effect = {'names': [name, *rivals], 'evidence': _evidence(search, name)}
         if rivals:
-            effect['rivals'] = [{'name': rival,
-                                 'evidence': _evidence(search, rival),
-                                 'parameters': _parameters(search, search.trials[rival], rival,
-                                                           robot)} for rival in rivals]
-        parts = _parameters(search, search.chosen, name, robot)
+            effect['rivals'] = [{'name': rival, 'parameters': _of_all(rival, _estimates(
+                search, search.trials[rival], rival, robot))} for rival in rivals]
+        of_units = _estimates(search, search.chosen, name, robot)
         if CATALOGUE[name].each != 'joint':
-            result.append(effect | {'parameters': parts})
+            result.append(effect | {'parameters': _of_all(name, of_units)})
             continue
-        s = search.servos
         moved = s.visible(search.chosen, search.trials[name]) & s.changed(search.chosen, name)
-        for unit in np.flatnonzero(moved):
-            number = s.units[unit][2]
-            own = {key: {'value': entry['each'][str(number)], 'unit': entry['unit'],
-                         'interval': entry['intervals'][str(number)],
-                         'file': entry['files'][str(number)],
-                         'written': float(catalogue_values(search.values()[unit],
-                                                           robot)[name][key])}
-                   for key, entry in parts.items()}
-            result.append(effect | {'joint': number, 'parameters': own})
+        result += [effect | {'joint': number, 'parameters': of_units[number]}
+                   for (*_, number), seen in zip(s.units, moved, strict=True) if seen]
     return result
 
 
@@ -187,31 +173,50 @@ def _rivals(search, name):
     return sorted(rivals, key=lambda other: -rivals[other])
 
 
-def _parameters(search, trial, name, robot):
-    """Parameter -> value (median joint), unit, 95 % interval, value in the file, each joint's."""
-    s, spec, joined = search.servos, CATALOGUE[name].parameters, {}
-    file = file_sets(robot, flown=True)
-    # An entry that the log neither needs nor excludes widens the intervals of the others.
+def _estimates(search, trial, name, robot):
+    """
+    Number of a joint -> parameters of an entry by name.
+
+    Value, unit, 95 % interval, value of the file, and the one that a corrected file has. An entry
+    that the log neither needs nor excludes widens the intervals of the others.
+    """
+    s, spec, file = search.servos, CATALOGUE[name].parameters, file_sets(robot, flown=True)
     possible = [trial, *(search.trials[other] for other, gain in search.gains.items()
                          if trial is search.chosen and other not in trial.entries
                          and gain > -CERTAIN)]
-    for parameter in spec:
-        each, ends, files = {}, {}, {}
-        for unit, (*_, number) in enumerate(s.units):
-            def reported(values, unit=unit, parameter=parameter):
-                value = catalogue_values(values, robot)[name][parameter]
-                return value - _constant(s, unit, values) if name == 'joint_offset' else value
-            estimates = [_derived(one, unit, reported) for one in possible]
-            each[str(number)] = estimates[0][0]
-            ends[str(number)] = [min(value - WIDTH * error for value, error in estimates),
-                                 max(value + WIDTH * error for value, error in estimates)]
-            files[str(number)] = float(reported(file[number - 1]))
-        low, high = np.median(list(ends.values()), axis=0)
-        joined[parameter] = {
-            'value': float(np.median(list(each.values()))), 'unit': spec[parameter].unit,
-            'file': float(np.median(list(files.values()))),
-            'interval': [max(float(low), spec[parameter].low), float(high)],
-            'each': each, 'intervals': ends, 'files': files}
+
+    def written(values):
+        found = catalogue_values(values, robot)[name]
+        return np.array([found[parameter] for parameter in spec])
+
+    result = {}
+    for unit, (*_, number) in enumerate(s.units):
+        def reported(values, unit=unit):
+            zero = _constant(s, unit, values) if name == 'joint_offset' else 0.0
+            return written(values) - zero
+
+        value, error = np.swapaxes([_derived(one, unit, reported) for one in possible], 0, 1)
+        low, high = (value - WIDTH * error).min(axis=0), (value + WIDTH * error).max(axis=0)
+        result[number] = {
+            parameter: {'value': here, 'unit': spec[parameter].unit, 'interval': list(ends),
+                        'file': known, 'written': new}
+            for parameter, here, *ends, known, new in zip(spec, *(column.tolist() for column in (
+                value[0], low, high, reported(file[number - 1]),
+                written(search.values()[unit]))), strict=True)}
+    return result
+
+
+def _of_all(name, of_units):
+    """The median joint of :func:`_estimates`, with the value of each joint."""
+    joined = {}
+    for parameter, spec in CATALOGUE[name].parameters.items():
+        own = {str(number): one[parameter] for number, one in of_units.items()}
+        value, file, (low, high) = (
+            np.median([one[key] for one in own.values()], axis=0).tolist()
+            for key in ('value', 'file', 'interval'))
+        joined[parameter] = {'value': value, 'unit': spec.unit, 'file': file,
+                             'interval': [max(low, spec.low), high],
+                             'each': {number: one['value'] for number, one in own.items()}}
     return joined
 
 
@@ -232,13 +237,14 @@ def _constant(servos, unit, values):
 
 
 def _derived(trial, unit, function):
-    """A function of a unit's parameter set, and its standard error by the delta method."""
+    """Values (n,) of a unit's parameter set, and standard errors (n,) by the delta method."""
     theta = trial.fit.theta[unit]
     covariance = trial.fit.spread()[unit]
-    value, slopes = function(decoded(theta)), np.zeros(len(theta))
+    value = function(decoded(theta))
+    slopes = np.zeros((len(value), len(theta)))
     for p in np.flatnonzero(mask(trial.entries)):
         step = STEP * max(np.sqrt(covariance[p, p]), 1e-9)
         moved = theta.copy()
         moved[p] += step
-        slopes[p] = (function(decoded(moved)) - value) / step
-    return float(value), float(np.sqrt(slopes @ covariance @ slopes))
+        slopes[:, p] = (function(decoded(moved)) - value) / step
+    return value, np.sqrt([slope @ covariance @ slope for slope in slopes])

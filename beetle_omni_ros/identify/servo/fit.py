@@ -114,6 +114,8 @@ class Servos:
             self.spreads[INDEX['delay']] = replace(delay, groups={'log': delay.groups['log']})
         self.labels: dict[str, Sequence] = {'joint': [number for *_, number in self.units],
                        'log': [k for k, *_ in self.units], 'unit': self.units}
+        self.of_log = [np.flatnonzero([own == k for own, *_ in self.units])
+                       for k in range(len(self.logs))]
         self._parts = [log.first() for log in self.logs]
         self.rows = [np.flatnonzero((log.fresh & (log.t >= log.t[0] + SETTLING))[:log.end])
                      for log in self.logs]
@@ -132,18 +134,18 @@ class Servos:
     def __call__(self, theta: np.ndarray, active: np.ndarray):
         """Whitened residuals and their derivatives; see :func:`hierarchy.solve`."""
         residuals, slopes = [], []
-        for k, log in enumerate(self.logs):
-            mine = np.flatnonzero(np.array(self.labels['log']) == k)
-            read, change = self.readings(k, theta[mine], active)
-            both = np.concatenate([(read - log.measured[:, self.rows[k]])[None], change])
-            white = self.noise[k].whitened((both / self.sigma[mine, None]).transpose(2, 1, 0))
+        for k, mine in enumerate(self.of_log):
+            error, change = self.errors(k, theta, active)
+            both = np.concatenate([error[None], change]) / self.sigma[mine, None]
+            white = self.noise[k].whitened(both.transpose(2, 1, 0))
             residuals += list(white[:, :, 0].T)
             slopes += list(white[:, :, 1:].transpose(1, 2, 0))
         return residuals, slopes
 
-    def readings(self, k, theta, active):
-        """Readings (J, n) and their derivatives (P, J, n) at the fitted rows of a log."""
-        log, rows, count = self.logs[k], self.rows[k], len(theta)
+    def errors(self, k: int, theta: np.ndarray, active: np.ndarray):
+        """Predictions minus readings (J, n) of a log's fitted rows, and derivatives (P, J, n)."""
+        log, rows, theta = self.logs[k], self.rows[k], theta[self.of_log[k]]
+        count = len(theta)
         moved = [p for p in np.flatnonzero(active) if NAMES[p] not in READING_ERRORS]
         # Inward at an upper bound, and from a limit without effect.
         steps = {p: np.where(theta[:, p] + STEP[p] > HIGH[p], -STEP[p], STEP[p]) for p in moved}
@@ -159,7 +161,7 @@ class Servos:
         for name, shape in READING_ERRORS.items():
             if active[INDEX[name]]:
                 change[INDEX[name]] = shape(read[0])
-        return read[0], change
+        return read[0] - log.measured[:, rows], change
 
     # ---- fits
     def estimate_noise(self, entries: Sequence[str], start=()) -> ServoModel:
@@ -173,11 +175,10 @@ class Servos:
         trial, active = self.fit(entries, start), mask(entries)
         for _ in range(2):
             for k, log in enumerate(self.logs):
-                mine = np.flatnonzero(np.array(self.labels['log']) == k)
-                read, change = self.readings(k, trial.fit.theta[mine], active)
+                mine = self.of_log[k]
+                errors, change = self.errors(k, trial.fit.theta, active)
                 signals = [slopes.T @ part for slopes, part in zip(
                     change.transpose(1, 0, 2), trial.fit.s[mine], strict=True)]
-                errors = read - log.measured[:, self.rows[k]]
                 clipped = [np.clip(e, -HUBER * scale_of(e), HUBER * scale_of(e)) for e in errors]
                 self.noise[k], sigma = drifting([e - a @ trial.fit.x for e, a in zip(
                     clipped, signals, strict=True)], signals, self._slowest(k))
@@ -356,13 +357,10 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
     return Search(servos, full, chosen, trials, gains)
 
 
-def error_rms(log: JointLog, joint: int, values: np.ndarray, held: bool = True,
-              part: slice = slice(None)) -> float:
-    """RMS [rad] of prediction minus reading at fresh rows of the joint with this index."""
-    rows = np.arange(len(log.t))[part]
-    rows = rows[log.fresh[rows]]
-    error = simulate(log, joint, values[None], held)[0] - log.measured[joint]
-    return rms(error[rows])
+def error_rms(log: JointLog, joint: int, predicted: np.ndarray, part: slice = slice(None)
+              ) -> float:
+    """RMS [rad] of a prediction (N,) minus the fresh readings of the joint with this index."""
+    return rms((predicted - log.measured[joint])[part][log.fresh[part]])
 
 
 def rms(values: np.ndarray) -> float:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros.bags.bag import BagError, read_bag, read_messages
+from beetle_omni_ros.identify.recording.series import held_at, integral, runs
 from beetle_omni_ros.model.files import LogError, missing, read_table
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
@@ -88,25 +89,23 @@ class JointLog:
 
     @cached_property
     def _commands(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Times (M,), commands (n, M) with a straight line before the log, their integrals."""
+        """Times (M,), commands (M, n) with a straight line before the log, their integrals."""
         slope = np.polyfit(self.t[:self._first] - self.t[0], self.command[:, :self._first].T, 1)[0]
         back = -self.period * np.arange(int(HISTORY / self.period) + 1, 0, -1)
         t = np.concatenate([self.t[0] + back, self.t])
         command = np.concatenate([self.command[:, :1] + slope[:, None] * back, self.command], 1)
-        total = np.cumsum(command[:, :-1] * np.diff(t), axis=1)
-        return t, command, np.concatenate([np.zeros((len(command), 1)), total], axis=1)
+        return t, *integral(t, command.T)
 
     def command_at(self, joint: int, times: np.ndarray) -> np.ndarray:
         """Command of a joint (index) by linear interpolation [rad]; linear before the log."""
         t, command, _ = self._commands
-        return np.interp(times, t, command[joint])
+        return np.interp(times, t, command[:, joint])
 
     def held_command(self, joint: int, edges: np.ndarray) -> np.ndarray:
         """Means (K,) over the steps between ``edges`` (K + 1,) of the command held until a row."""
-        t, command, total = self._commands
-        row = np.maximum(np.searchsorted(t, edges, side='right') - 1, 0)
-        integral = total[joint, row] + command[joint, row] * (edges - t[row])
-        return np.diff(integral) / np.diff(edges)
+        t, *commands = self._commands
+        sums = held_at(edges, t, *(part[:, joint, None] for part in commands))[:, 0]
+        return np.diff(sums) / np.diff(edges)
 
     @property
     def end(self) -> int:
@@ -295,13 +294,12 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     t, position = log.joint.t[fresh], log.joint.position[fresh]
     last = np.searchsorted(received, t, side='right') - 1
     driven = (last >= 0) & (t - received[np.maximum(last, 0)] <= LAST_COMMAND)
-    edges = np.flatnonzero(np.diff(np.r_[False, driven, False].astype(int)))
-    stretches = edges.reshape(-1, 2)
-    if not len(stretches):
+    stretches = runs(driven)
+    if not stretches:
         raise LogError(f'{path}: no joint_states during the commands; expected stamps of both by '
                        'one clock')
-    first, end = stretches[np.argmax(stretches[:, 1] - stretches[:, 0])]
-    first, end = _most_motion(t, tilt[last], first, end)
+    first, length = max(stretches, key=lambda stretch: stretch[1])
+    first, end = _most_motion(t, tilt[last], first, first + length)
     chosen = slice(first, end)
     return t[chosen] - t[first], position[chosen].T, tilt[last[chosen]].T
 

@@ -45,6 +45,17 @@ GAIN = 'reading_gain'
 LOOSE = 1.5         # half width of an interval, in scales, below which no pair is reported
 TRADED = 0.6        # least correlation of a pair that a log does not separate
 DELAYS = np.arange(0.0, 0.12, 5e-4)     # [s] of a line
+# RMS error -> its row of a table, model (the better one of servo and line: best) and part.
+ERRORS = {
+    'published_rms_rad': ('robot file, whole log', 'file', 'whole'),
+    'published_heldout_rms_rad': ('robot file, held-out part', 'file', 'held out'),
+    'fit_rms_rad': ('identified, fitted part', 'best', 'fitted'),
+    'heldout_rms_rad': ('identified, held-out part', 'best', 'held out'),
+    'servo_heldout_rms_rad': ('', 'servo', 'held out'),
+    'published_validation_rms_rad': ('robot file, {}', 'file', 'further'),
+    'validation_rms_rad': ('identified, {}', 'best', 'further')}
+MOTIONS = {'angle_rad': 'angle [rad]', 'rate_rad_s': 'rate [rad/s]',
+           'acceleration_rad_s2': 'acceleration [rad/s^2]'}
 
 
 def identify(logs: Sequence[JointLog], robot: RobotParameters, as_file: bool = False) -> Search:
@@ -89,39 +100,35 @@ def fitted_line(log: JointLog, joint: int, rows: np.ndarray) -> tuple[float, flo
     return best
 
 
-def line_errors(line: tuple[float, float, float], log: JointLog, joint: int, rows: np.ndarray
-                ) -> np.ndarray:
-    """Prediction of a line minus reading [rad] at fresh rows."""
+def line_at(line: tuple[float, float, float], log: JointLog, joint: int) -> np.ndarray:
+    """Predictions (N,) of a line [rad]; nan in rows without a reading."""
     delay, slope, offset = line
-    return slope * log.command_at(joint, log.read_t[rows] - delay) + offset \
-        - log.measured[joint, rows]
+    return slope * log.command_at(joint, log.read_t - delay) + offset
 
 
 def left_out_rms(search: Search, unit: int) -> tuple[float, float]:
     """RMS errors [rad] of servo and line at kinds of motion that their fits leave out."""
     s, fit, (k, joint, _) = search.servos, search.chosen.fit, search.servos.units[unit]
-    block, rows = s.blocks[unit], s.rows[k]
-    mine = np.array(s.labels['log']) == k
-    read, slopes = s.readings(k, fit.theta[mine], mask(search.chosen.entries))
+    log, block, rows = s.logs[k], s.blocks[unit], s.rows[k]
+    errors, slopes = s.errors(k, fit.theta, mask(search.chosen.entries))
     moved = slopes[:, joint].T @ fit.s[unit] @ fit.deviations.T
-    servo = read[joint] - s.logs[k].measured[joint, rows] + moved[np.arange(len(rows)), block]
-    line = [line_errors(fitted_line(s.logs[k], joint, rows[block != b]), s.logs[k], joint,
-                        rows[block == b]) for b in np.unique(block)]
+    servo = errors[joint] + moved[np.arange(len(rows)), block]
+    line = [(line_at(fitted_line(log, joint, rows[block != b]), log, joint)
+             - log.measured[joint])[rows[block == b]] for b in np.unique(block)]
     return rms(servo), rms(np.concatenate(line))
 
 
 def joint_results(search: Search, validations: Sequence[JointLog], robot: RobotParameters) -> dict:
     """Return ``meta``, ``joints`` (those of the first log) and ``text``, their summary."""
-    log, fit = search.servos.logs[0], search.chosen.fit
     joints = [_joint(search, unit, validations, robot)
               for unit, (k, *_) in enumerate(search.servos.units) if k == 0]
     about: dict[str, list[str]] = {}    # sentence -> numbers of the joints that have it
     for joint in joints:
         for text in joint['text']:
             about.setdefault(text, []).append(str(joint['joint']))
-    return {'meta': {'log': log.name, 'logs': [each.name for each in search.servos.logs],
+    return {'meta': {'logs': [log.name for log in search.servos.logs],
                      'validate': [other.name for other in validations],
-                     'converged': bool(fit.converged), 'version': __version__},
+                     'converged': bool(search.chosen.fit.converged), 'version': __version__},
             'joints': joints, 'text': [
                 f'Joint{"s" if len(numbers) > 1 else ""} {", ".join(numbers)}: {text}'
                 for text, numbers in about.items()]}
@@ -129,35 +136,31 @@ def joint_results(search: Search, validations: Sequence[JointLog], robot: RobotP
 
 def _joint(search, unit, validations, robot):
     log, (_, index, number) = search.servos.logs[0], search.servos.units[unit]
-    file, is_held = file_sets(robot)[number - 1], held(robot)
-    values, first, last = search.values()[unit], slice(0, log.end), slice(log.end, None)
+    file, is_held, values = file_sets(robot)[number - 1], held(robot), search.values()[unit]
+    line, apart = fitted_line(log, index, search.servos.rows[0]), left_out_rms(search, unit)
     known = [(other, other.joints.index(number) if number in other.joints else None)
              for other in validations]
-    line, apart = fitted_line(log, index, search.servos.rows[0]), left_out_rms(search, unit)
+
+    def errors(predicted):
+        here = predicted(log, index)
+        return {'whole': error_rms(log, index, here),
+                'fitted': error_rms(log, index, here, slice(0, log.end)),
+                'held out': error_rms(log, index, here, slice(log.end, None)),
+                'further': [None if k is None else error_rms(other, k, predicted(other, k))
+                            for other, k in known]}
+
+    of = {'file': errors(lambda log, k: simulate(log, k, file, is_held)[0]),
+          'servo': errors(lambda log, k: simulate(log, k, values)[0]),
+          'line': errors(lambda log, k: line_at(line, log, k))}
     best = 'servo' if apart[0] <= apart[1] else 'line'
-
-    def of_line(other, k, part=slice(None)):
-        return rms(line_errors(line, other, k, np.arange(len(other.t))[part][other.fresh[part]]))
-
-    def predicted(other, k, part=slice(None)):
-        return error_rms(other, k, values, part=part) if best == 'servo' else of_line(
-            other, k, part)
-
-    traded = inseparable(search, unit)
+    of['best'], traded = of[best], inseparable(search, unit)
     return {
         'joint': number, 'best': best,
         'left_out_rms_rad': dict(zip(('servo', 'line'), apart, strict=True)),
         'line': {'gain': line[1] - 1, 'offset_rad': line[2], 'delay_s': line[0],
-                 'heldout_rms_rad': of_line(log, index, last)},
+                 'heldout_rms_rad': of['line']['held out']},
         'holds_for': log.first().motion(index),
-        'published_rms_rad': error_rms(log, index, file, is_held),
-        'fit_rms_rad': predicted(log, index, first),
-        'heldout_rms_rad': predicted(log, index, last),
-        'servo_heldout_rms_rad': error_rms(log, index, values, part=last),
-        'validation_rms_rad': [None if k is None else predicted(other, k) for other, k in known],
-        'published_heldout_rms_rad': error_rms(log, index, file, is_held, part=last),
-        'published_validation_rms_rad': [
-            None if k is None else error_rms(other, k, file, is_held) for other, k in known],
+        **{key: of[model][part] for key, (_, model, part) in ERRORS.items()},
         'terms': _terms(search, unit), 'traded': traded,
         'text': sentences(search, unit, traded, best)}
 
@@ -214,28 +217,24 @@ def grids(results: dict) -> list[Grid]:
     """Errors, range of motion and terms of the model, a column for each joint."""
     joints = results['joints']
     header = ['', *(f'joint {joint["joint"]}' for joint in joints)]
-    rows = [(text, [joint[key] for joint in joints]) for text, key in (
-        ('robot file, whole log', 'published_rms_rad'),
-        ('robot file, held-out part', 'published_heldout_rms_rad'),
-        ('identified, fitted part', 'fit_rms_rad'),
-        ('identified, held-out part', 'heldout_rms_rad'))]
-    rows.append(('line (gain, offset, delay), held-out part',
-                 [joint['line']['heldout_rms_rad'] for joint in joints]))
-    rows += [(f'{text}, {name}', [joint[f'{key}_rms_rad'][k] for joint in joints])
-             for k, name in enumerate(results['meta']['validate'])
-             for text, key in (('robot file', 'published_validation'),
-                               ('identified', 'validation'))]
-    errors = Grid('Prediction error, RMS [mrad]', header, [
-        [text, *('absent' if value is None else f'{MILLI * value:.2f}' for value in values)]
-        for text, values in rows])
-    motion = Grid('Motion of the fitted part, for which the model holds', header, [
-        [text, *('{:.3g}..{:.3g}'.format(*joint['holds_for'][key]) for joint in joints)]
-        for text, key in (('angle [rad]', 'angle_rad'), ('rate [rad/s]', 'rate_rad_s'),
-                          ('acceleration [rad/s^2]', 'acceleration_rad_s2'))])
-    return [errors, motion, Grid('Terms with 95 % interval', header, [
-        [f'{name} [{SMALL.get(term["unit"], "") + term["unit"]}]',
-         *(_value(joint['terms'][name]) for joint in joints)]
-        for name, term in joints[0]['terms'].items() if term['kept']])]
+    errors = [(text, [joint[key] for joint in joints])
+              for key, (text, _, part) in ERRORS.items() if text and part != 'further']
+    errors.append(('line (gain, offset, delay), held-out part',
+                   [joint['line']['heldout_rms_rad'] for joint in joints]))
+    errors += [(text.format(name), [joint[key][k] for joint in joints])
+               for k, name in enumerate(results['meta']['validate'])
+               for key, (text, _, part) in ERRORS.items() if part == 'further']
+    return [
+        Grid('Prediction error, RMS [mrad]', header, [
+            [text, *('absent' if one is None else f'{MILLI * one:.2f}' for one in values)]
+            for text, values in errors]),
+        Grid('Motion of the fitted part, for which the model holds', header, [
+            [text, *('{:.3g}..{:.3g}'.format(*joint['holds_for'][key]) for joint in joints)]
+            for key, text in MOTIONS.items()]),
+        Grid('Terms with 95 % interval', header, [
+            [f'{name} [{SMALL.get(term["unit"], "") + term["unit"]}]',
+             *(_value(joint['terms'][name]) for joint in joints)]
+            for name, term in joints[0]['terms'].items() if term['kept']])]
 
 
 def _value(term):
@@ -248,15 +247,18 @@ def _value(term):
 
 def flown_errors(logs: Sequence[JointLog], robots: dict[str, RobotParameters]) -> Grid:
     """Errors of robots as the simulator flies them, behind its delays and with the logs' zeros."""
-    rows = []
-    for log in logs:
-        for name, robot in robots.items():
-            sets = file_sets(robot, flown=True)[np.array(log.joints) - 1]
-            error = simulate(log, np.arange(len(sets)), sets) - log.measured
-            rows.append([f'{log.name}, {name}', *(f'{MILLI * np.std(one[log.fresh]):.1f}'
-                                                  for one in error)])
+    numbers = sorted({number for log in logs for number in log.joints})
+
+    def error(log, robot, number):
+        if number not in log.joints:
+            return 'absent'
+        k, values = log.joints.index(number), file_sets(robot, flown=True)[number - 1]
+        return f'{MILLI * np.std((simulate(log, k, values)[0] - log.measured[k])[log.fresh]):.1f}'
+
     return Grid('RMS error of the servos as simulated, without zeros [mrad]',
-                ['', *(f'joint {number}' for number in logs[0].joints)], rows)
+                ['', *(f'joint {number}' for number in numbers)],
+                [[f'{log.name}, {name}', *(error(log, robot, number) for number in numbers)]
+                 for log in logs for name, robot in robots.items()])
 
 
 def sections(search: Search, others: Sequence[JointLog], robot: RobotParameters) -> list[str]:
@@ -269,7 +271,7 @@ def sections(search: Search, others: Sequence[JointLog], robot: RobotParameters)
             'Left: command (grey) and measured position. Right: simulations of the robot file and '
             'of the identified model minus measurement.',
             svg(_figure(other, models, robot, k < len(logs)), other.name))
-            for k, other in enumerate([*logs, *others])]
+            for k, other in enumerate([*logs, *others]) if models.keys() & set(other.joints)]
 
 
 def _figure(log, models, robot, fitted) -> Figure:
