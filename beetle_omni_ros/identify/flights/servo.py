@@ -117,7 +117,7 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray, whic
     step = Step(NUMPY, Servo(
         joint.inertia * column('swing.ratio', np.exp), kp, kd, speed,
         effort if (effort < reach).any() else None, coulomb=first.coulomb,
-        stiction=first.stiction), windows.step)
+        stiction=first.stiction, speed_gradient=joint.speed_gradient), windows.step)
     q = np.broadcast_to(windows.start, (len(sets), *windows.start.shape)).copy()
     v = np.broadcast_to(windows.start_rate, q.shape).copy()
     shown = np.empty(((targets.shape[1] - windows.skip) // windows.every, *q.shape))
