@@ -24,6 +24,7 @@ from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.parts import JointParameters
 
 SLIDING_RATE = 0.05     # [rad/s] over which friction falls from stiction to Coulomb friction
+TINY = 1e-9             # [rad/(N m s)] gradient of a motor that holds every load
 # Functions in which the libraries differ, by numpy's names.
 NUMPY: Any = np
 CASADI: Any = SimpleNamespace(minimum=ca.fmin, maximum=ca.fmax, exp=ca.exp, sqrt=ca.sqrt,
@@ -67,8 +68,8 @@ class Servo:
     def fastest(self, space, rate, load, duration):
         """Rates after ``duration`` [s] at full voltage to either side, with a ``load`` [N m]."""
         # exact solutions of J q'' = (+-limit - q') / gradient + load
-        slope = self.speed_gradient
-        keep = space.exp(-duration / (self.inertia * slope)) if slope else 0.0
+        slope = space.maximum(self.speed_gradient, TINY)
+        keep = space.exp(-duration / (self.inertia * slope))
         middle, most = keep * rate + (1 - keep) * slope * load, (1 - keep) * self.velocity_limit
         return middle - most, middle + most
 
