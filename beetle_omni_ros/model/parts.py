@@ -62,7 +62,10 @@ class JointParameters:
     inertia: float = parameter(doc='effective inertia', unit='kg m^2', low=1e-7, high=1)
     kp: float = parameter(doc='stiffness', unit='N m/rad', low=1e-4, high=1e3)
     kd: float = parameter(doc='damping', unit='N m s/rad', low=0, high=1e2)
-    velocity_limit: float = parameter(doc='largest rate', unit='rad/s', low=0.1, high=100)
+    velocity_limit: float = parameter(
+        doc='largest rate without load', unit='rad/s', low=0.1, high=100)
+    speed_gradient: float = parameter(
+        0.0, doc='loss of the largest rate for each torque', unit='rad/(N m s)', low=0, high=1e4)
     effort_limit: float = parameter(doc='largest torque', unit='N m', low=0.01, high=100)
     position_limit: float = parameter(doc='travel to each side', unit='rad', low=0.1, high=100)
 

@@ -1,10 +1,13 @@
 """
 Equation and time step of the tilt servo, for numpy, CasADi and torch.
 
-    J q'' = clip(Kp (q* - q) - Kd q', effort limit) + load - friction,   |q'| <= rate limit
+    J q'' = clip(Kp (q* - q) - Kd q', effort limit, line) + load - friction
 
-Friction is Coulomb friction, and at low rates up to the stiction (Armstrong-Helouvry 1994). Torch
-and C code for training and control are generated from CasADi.
+The line is that of a DC motor at full voltage: its torque falls with the speed, by one over the
+gradient, to zero at the rate limit. So a load changes the largest rate by gradient times load. A
+gradient of zero is a motor that holds every load there. Friction is Coulomb friction, and at low
+rates up to the stiction (Armstrong-Helouvry 1994). Torch and C code for training and control are
+generated from CasADi.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.parts import JointParameters
 
 SLIDING_RATE = 0.05     # [rad/s] over which friction falls from stiction to Coulomb friction
+TINY = 1e-9             # [rad/(N m s)] gradient of a motor that holds every load
 # Functions in which the libraries differ, by numpy's names.
 NUMPY: Any = np
 CASADI: Any = SimpleNamespace(minimum=ca.fmin, maximum=ca.fmax, exp=ca.exp, sqrt=ca.sqrt,
@@ -39,12 +43,13 @@ class Servo:
     position_limit: Any = None  # travel to each side [rad]
     coulomb: Any = None         # sliding friction [N m]
     stiction: Any = None        # friction at rest [N m]
+    speed_gradient: Any = 0.0   # loss of speed at the rate limit for each torque [rad/(N m s)]
 
     @classmethod
     def of(cls, joints: JointParameters, **more) -> Servo:
         """Servo of a robot file; ``more`` adds or replaces numbers."""
         return cls(**{name: getattr(joints, name) for name in (
-            'inertia', 'kp', 'kd', 'velocity_limit', 'effort_limit')} | more)
+            'inertia', 'kp', 'kd', 'velocity_limit', 'effort_limit', 'speed_gradient')} | more)
 
     def friction(self, space, rate):
         """Largest friction at a rate [N m]."""
@@ -59,6 +64,14 @@ class Servo:
         """Torque of the motor [N m] at a position error [rad] and a rate [rad/s]."""
         torque = self.kp * error - self.kd * rate
         return torque if self.effort_limit is None else _within(space, torque, self.effort_limit)
+
+    def fastest(self, space, rate, load, duration):
+        """Rates after ``duration`` [s] at full voltage to either side, with a ``load`` [N m]."""
+        # exact solutions of J q'' = (+-limit - q') / gradient + load
+        slope = space.maximum(self.speed_gradient, TINY)
+        keep = space.exp(-duration / (self.inertia * slope))
+        middle, most = keep * rate + (1 - keep) * slope * load, (1 - keep) * self.velocity_limit
+        return middle - most, middle + most
 
     def acceleration(self, space, target, tilt, rate, load=0.0):
         """Acceleration [rad/s^2] at one instant, smooth except at the limits."""
@@ -82,6 +95,7 @@ class Step:
 
     def __init__(self, space, servo: Servo, duration: float):
         self._space, self._servo, self._half = space, servo, 0.5 * duration
+        self._duration = duration
         per_torque = duration / servo.inertia
         damping = 0.5 * per_torque * servo.kd
         self.gain = per_torque / (1 + damping)      # change of rate for each N m [rad/s]
@@ -105,16 +119,14 @@ class Step:
             push = push - self._damping * self.gain * load
         if servo.effort_limit is not None:
             push = _within(space, push, self._per_torque * servo.effort_limit)
-        after = rate + push
-        if load is not None:
-            if servo.velocity_limit is not None:    # of the motor; a load may drive it faster
-                after = _within(space, after, servo.velocity_limit)
-            after = after + self._per_torque * load
+        after, load = rate + push, 0.0 if load is None else load
+        after = after + self._per_torque * load
         if servo.coulomb is not None:
-            after = after - _within(
-                space, after, self._slides + self._sticks * servo.fading(space, rate))
-        if load is None and servo.velocity_limit is not None:
-            after = _within(space, after, servo.velocity_limit)
+            lost = _within(space, after, self._slides + self._sticks * servo.fading(space, rate))
+            after, load = after - lost, load - lost / self.gain
+        if servo.velocity_limit is not None:
+            low, high = servo.fastest(space, rate, load, self._duration)
+            after = space.minimum(space.maximum(after, low), high)
         return after
 
     def __call__(self, target, tilt, rate, load=None):

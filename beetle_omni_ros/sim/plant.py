@@ -85,8 +85,9 @@ class Plant:
         joints = np.linalg.norm(self.model.body_pos[BASE + 1:], axis=1)
         sizes = np.linalg.norm(self.model.geom_pos[1:], axis=1) + self.model.geom_rbound[1:]
         self._reach = float(joints.max() + sizes.max())
-        # Largest change of a servo's rate in a tick for each rad of error.
-        self._rate_gain = float(np.max(robot.joints.kp)) * self._tick / robot.joints.inertia
+        # Largest change of a servo's rate and of its limit in a tick for each rad of error.
+        self._rate_gain = float(np.max(robot.joints.kp)) * (
+            self._tick / robot.joints.inertia + robot.joints.speed_gradient)
         # Views of MuJoCo's state, stored because each access takes time.
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
@@ -176,9 +177,10 @@ class Plant:
             # Torques on the joints at the end of the last tick, but for motor and friction.
             others = self._robot.joints.inertia * data.qacc[6:] - data.actuator_force[4:] \
                 - self._friction
+            held = -self._friction if touching else others      # forces of contacts are no load
             for _ in range(substeps):
                 if not fast:
-                    self._limit_rates()
+                    self._limit_rates(held + self._friction)
                 if self._has_friction:
                     self._rub(others)
                 mujoco.mj_step(model, data)
@@ -191,7 +193,7 @@ class Plant:
         else:
             # The acceleration must also use the limited torque: the full one would give
             # thousands of rad/s^2 at the rate limit.
-            self._limit_rates()
+            self._limit_rates(held + self._friction)
             self._update()
             effort = self._robot.joints.effort_limit
             model.actuator_forcerange[4:] = (-effort, effort)
@@ -212,14 +214,13 @@ class Plant:
                 fast = False
         return touching, fast
 
-    def _limit_rates(self):
-        """Limit each servo's torque so that its joint does not exceed the rate limit."""
-        joints, rate = self._robot.joints, self._rate
-        gain = joints.inertia / self.model.opt.timestep
-        limits = self.model.actuator_forcerange
-        effort, rate_limit = joints.effort_limit, joints.velocity_limit
-        limits[4:, 0] = clipped(gain * (-rate_limit - rate), -effort, effort)
-        limits[4:, 1] = clipped(gain * (rate_limit - rate), -effort, effort)
+    def _limit_rates(self, load):
+        """Limit each servo's torque to what its motor has at its speed, with a load (4,) [N m]."""
+        joints, duration = self._robot.joints, self.model.opt.timestep
+        after = self._servo_terms[0].fastest(NUMPY, self._rate, load, duration)
+        self.model.actuator_forcerange[4:] = clipped(
+            joints.inertia / duration * (np.transpose(after) - self._rate[:, None])
+            - load[:, None], -joints.effort_limit, joints.effort_limit)
 
     def _apply_forces(self, ahead=0.0):
         """Apply the external wrench and the effects' forces, predicted ``ahead`` [s] from now."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from gap_data.cases import Case
 from gap_data.make import make_case
+from gap_data.truth import Robot
 import numpy as np
 import pytest
 
@@ -62,10 +63,10 @@ def test_a_hidden_effect_is_named_though_the_sensors_differ_from_flight_to_fligh
     assert any('joint feedback delay differs' in finding for finding in result['findings'])
 
 
-def one_flight(folder, **more):
+def one_flight(folder, *effects, **more):
     """The engine's model of one short flight."""
     keys = {**all_keys(ROBOT), **extra_keys(ROBOT)}
-    flight, = flights(folder, 7, duration=20.0, fit=1, **more)
+    flight, = flights(folder, 7, *effects, duration=20.0, fit=1, **more)
     return BagFlight(flight, ROBOT, BodyModel(ROBOT, keys, (0.0, 0.0)), keys, P)
 
 
@@ -75,6 +76,23 @@ def test_gains_loads_and_inertia_of_a_servo_have_one_common_factor(tmp_path):
     factor = ['joint_bandwidth.kp', 'joint_bandwidth.kd', 'swing.ratio', 'modules.share']
     slopes = made.linear({}, factor).slopes[:, 12:]
     assert np.abs(slopes.sum(axis=2)).max() < 1e-3 * np.abs(slopes).max()
+
+
+def test_a_limited_servo_of_another_plant_has_the_torque_and_speed_of_its_motor(tmp_path):
+    made = one_flight(tmp_path, ('joint_velocity_limit', 3.2, 'plain'))
+    made.modules, motor = 1.0, Robot().numbers['speed_torque_slope']
+    limit = 'joint_velocity_limit.velocity_limit'
+    fitted = [limit, 'droop.ratio', 'swing.ratio', 'base.tilt_delay', *(
+        f'servo.{gain}[{k}]' for gain in ('kp', 'kd') for k in range(4))]
+    theta = dict.fromkeys(fitted, 0.0) | {limit: np.log(0.34)}
+    for _ in range(4):
+        linear = made.linear(theta, fitted)
+        step = np.linalg.lstsq(linear.slopes[:, 12:].reshape(-1, len(fitted)),
+                               -linear.residual[:, 12:].ravel(), rcond=None)[0]
+        theta = {name: theta[name] + part for name, part in zip(fitted, step, strict=True)}
+    assert ROBOT.joints.velocity_limit * np.exp(theta[limit]) == pytest.approx(3.3, rel=5e-3)
+    assert ROBOT.joints.speed_gradient * np.exp(theta['droop.ratio']) * motor == pytest.approx(
+        1.0, rel=0.1)
 
 
 def test_slopes_agree_with_differences_of_the_residual(tmp_path):

@@ -72,12 +72,19 @@ def test_a_load_beyond_the_motor_torque_moves_the_joint():
     assert rate == pytest.approx(-0.03 / servo.inertia * 1e-5)
 
 
-def test_a_motor_at_its_speed_limit_holds_no_load_which_may_drive_the_joint_faster():
-    servo = Servo(5e-5, 0.3, 0.01, velocity_limit=10.0, effort_limit=3.0)
-    step = Step(NUMPY, servo, 0.001)
-    assert step.kick(2.0, 0.0, 10.0, 0.0) == pytest.approx(10.0)
-    for load in (0.01, -0.01):
-        assert step.kick(2.0, 0.0, 10.0, load) == pytest.approx(10.0 + 0.001 / 5e-5 * load)
+@pytest.mark.parametrize('gradient', [14.0, 0.0])
+@pytest.mark.parametrize('duration', [2e-3, 1e-3, 2.5e-4])
+@pytest.mark.parametrize(('load', 'friction'), [(0.02, 0.0), (0.0, 0.0), (-0.02, 0.0),
+                                                (-0.01, 0.01)])
+def test_a_motor_at_full_voltage_gains_speed_as_in_closed_form_at_every_step(
+        gradient, duration, load, friction):
+    servo = Servo(7.5e-5, 0.3, 0.01, velocity_limit=10.0, effort_limit=3.0, coulomb=friction,
+                  stiction=friction, speed_gradient=gradient)
+    step, rate, end = Step(NUMPY, servo, duration), 7.0, 10.0 + gradient * (load - friction)
+    for time in duration * np.arange(1, 20):
+        rate = step.kick(9.0, 0.0, rate, load)
+        left = np.exp(-time / (gradient * servo.inertia)) if gradient else 0.0
+        assert rate == pytest.approx(end + (7.0 - end) * left)
 
 
 @pytest.mark.parametrize('name', ['measured', None])

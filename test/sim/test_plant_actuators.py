@@ -1,7 +1,13 @@
 """Servos and rotors of the plant have the response of their parameters."""
 
+from dataclasses import replace
+
 import numpy as np
-from sim_robots import immovable, plant, ROBOT
+import pytest
+from sim_robots import immovable, plant, ROBOT, WORLD
+
+from beetle_omni_ros.identify.flights.servo import simulate, Windows
+from beetle_omni_ros.sim.plant import Plant
 
 JOINT = ROBOT.joints
 TICK = 0.005
@@ -44,6 +50,34 @@ def test_tilt_rate_stays_at_its_limit():
     for _ in range(100):
         made.step()
     np.testing.assert_allclose(made.state[0][7:], [3.0, -3.0, 2.0, 1.5], atol=1e-3)
+
+
+@pytest.mark.parametrize('friction', [0.0, 0.01])
+@pytest.mark.parametrize('gradient', [JOINT.speed_gradient, 0.0])
+@pytest.mark.parametrize(('substeps', 'step'), [(5, 1.25e-3), (20, 1.25e-3), (5, 2.5e-4)])
+def test_plant_and_gap_turn_loaded_servos_alike_at_their_speed_limit_at_every_step(
+        friction, gradient, substeps, step):
+    values = {'coulomb': friction, 'stiction': friction}
+    robot = replace(immovable(), joints=replace(JOINT, speed_gradient=gradient),
+                    effects={'joint_friction': values} if friction else {})
+    made = Plant(robot, replace(WORLD, substeps=substeps))
+    made.reset((0.0, 0.0, 20.0))
+    tilts, fastest = [made.state[0][7:]], 0.0
+    for k in range(120):
+        made.set_targets(np.array([3.0, -3.0, 2.0, 1.5]) * (k < 80), np.zeros(4))
+        made.wrench[2] = 190 * 20.0     # weighs on the servos by their modules
+        made.step()
+        tilts.append(made.state[0][7:])
+        fastest = np.maximum(fastest, np.abs(made.state[1][6:]))
+    module, t = robot.multibody.module, step * (np.arange(120 * TICK / step) + 0.5)
+    tilt = np.stack([np.interp(t, TICK * np.arange(121), one) for one in np.transpose(tilts)])
+    load = -module.mass * 20.0 * module.centre_of_mass[2] * -np.sin(tilt.T[:, None])
+    targets = np.array([3.0, -3.0, 2.0, 1.5]) * (t < 80 * TICK)[:, None, None]
+    windows = Windows(np.zeros((1, 4)), np.zeros((1, 4)), 0 * load, load, step, 0,
+                      round(TICK / step))
+    shown = simulate(robot, windows, targets[None], [0], [{}], 1.0)[0, :, 0]
+    assert np.abs(fastest - JOINT.velocity_limit).max() > 0.3 * gradient * np.abs(load).max()
+    assert np.abs(shown - tilts[:-1]).max() < 3e-3
 
 
 def test_thrust_follows_first_order_lag_up_and_down():

@@ -33,6 +33,7 @@ OF_ONE = {parameter: name for name, treatment in TREATMENTS.items() for paramete
           treatment.sizes if CATALOGUE[name].parameters[parameter].of_each}
 # Effects without a slope at their neutral value; they need a start where they act.
 LIMITS = tuple(name for name, treatment in TREATMENTS.items() if treatment.starts)
+DROOP = 'droop.ratio'        # logarithm of the gradient of the servos' speed limit
 SWING = 'swing.ratio'        # logarithm of the apparent inertia of the servos
 TILT_BUS, THRUST_BUS = 'base.tilt_delay', 'base.thrust_delay'   # delays of commands
 # Typical and smallest deviations of the catalogue are those of a robot of this size.
@@ -188,7 +189,7 @@ def tolerances(p: GapParameters) -> dict[str, float]:
               for name, treatment in TREATMENTS.items()
               for parameter, size in treatment.sizes.items() if size.tolerance
               for key in names_of(name, parameter)}
-    result['modules.share'] = p.modules_tolerance
+    result |= {'modules.share': p.modules_tolerance, DROOP: p.tolerance_gradient}
     for k in range(4):
         result |= {f'rotor.lag[{k}]': p.tolerance_lag, f'servo.kp[{k}]': p.tolerance_lag,
                    f'servo.kd[{k}]': p.tolerance_lag}
@@ -209,7 +210,8 @@ def extra_keys(robot: RobotParameters) -> dict[str, Key]:
     for k in range(12):
         add(f'position.offset[{k}]', k, 0.001, 'B', body=True)
     add('modules.share', None, 0.05, 'BJ', step=0.05)
-    add(SWING, None, 0.3, 'J', step=0.01)
+    for name in (SWING, DROOP):
+        add(name, None, 0.3, 'J', step=0.01)
     common = all_keys(robot)
     for k in range(4):
         add(f'rotor.lag[{k}]', k, 0.1, 'B', step=0.02)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.identify.flights.keys import friction, Key, MODULES, OF_ONE
+from beetle_omni_ros.identify.flights.keys import DROOP, friction, Key, MODULES, OF_ONE
 from beetle_omni_ros.identify.flights.signals import Signals
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
 from beetle_omni_ros.identify.recording.bag import COMMAND
@@ -117,7 +117,8 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray, whic
     step = Step(NUMPY, Servo(
         joint.inertia * column('swing.ratio', np.exp), kp, kd, speed,
         effort if (effort < reach).any() else None, coulomb=first.coulomb,
-        stiction=first.stiction), windows.step)
+        stiction=first.stiction,
+        speed_gradient=joint.speed_gradient * column(DROOP, np.exp)), windows.step)
     q = np.broadcast_to(windows.start, (len(sets), *windows.start.shape)).copy()
     v = np.broadcast_to(windows.start_rate, q.shape).copy()
     shown = np.empty(((targets.shape[1] - windows.skip) // windows.every, *q.shape))

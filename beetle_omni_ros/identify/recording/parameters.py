@@ -57,6 +57,7 @@ class GapParameters:
     tolerance_position: float = _size('m', 'Prior deviation of a rotor position, each axis.')
     tolerance_lag: float = _share('Prior deviation of lags and servo gains.')
     tolerance_speed: float = _share('Prior deviation of the speed limit of the servos.')
+    tolerance_gradient: float = _share('Prior deviation of its change by a load.')
     tolerance_torque_ratio: float = _share('Prior deviation of torque over thrust.')
     tolerance_bias_accelerometer: float = _size(
         'm/s^2', 'Prior deviation of the bias of the accelerometer.', 10)
