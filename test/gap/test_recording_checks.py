@@ -24,7 +24,7 @@ from beetle_omni_ros.identify.recording.bag import (
 from beetle_omni_ros.identify.recording.check import checked
 from beetle_omni_ros.identify.recording.flight import prepare, UnusableFlight
 from beetle_omni_ros.identify.recording.parameters import GapParameters, RecordingLimits
-from beetle_omni_ros.identify.recording.topics import sensor_damages
+from beetle_omni_ros.identify.recording.topics import judge, sensor_damages
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.resources import share_path
 
@@ -332,6 +332,15 @@ def test_rests_on_the_ground_are_neither_damage_nor_flight(before, after):
     with pytest.raises(UnusableFlight, match='frozen') as error:
         prepare(damaged, ROBOT, P)
     assert error.value.problems[0].at_s == pytest.approx(before + 10, abs=0.1)
+
+
+def test_overlapping_windows_of_one_motion_make_no_step_of_a_clock():
+    at, steady = np.arange(30.0), np.random.default_rng(0).normal(0.1, 0.006, 30)
+    last, half = steady.copy(), np.where(at < 15, steady, steady + 0.12)
+    last[-3:] = -0.07, -0.015, 0.07      # a hover in gusts, 3 of 6 windows that share samples
+    assert judge(at, last, [-0.06, 0.35], 0.1, 6) is None
+    assert judge(at, last, [-0.06, 0.35], 0.1) is not None     # of other samples each
+    assert judge(at, half, [-0.06, 0.35], 0.1, 6)[0].startswith('steps by 0.12 s')
 
 
 def test_at_most_30_numbers_are_no_range_or_specification_and_state_their_meaning():

@@ -106,17 +106,19 @@ def lag_damage(name: str, relation: Relation, signals: Smoothed) -> Damage | Non
     """A lag of two motions that is out of range, steps or drifts."""
     late, early = (np.linalg.norm(x, axis=1) for x in relation.pair(signals))
     at, lags = window_lags(signals.t, late, early, signals.silent)
-    judged = judge(at, lags, getattr(shipped(), relation.lag), shipped().lag_step)
+    judged = judge(at, lags, getattr(shipped(), relation.lag), shipped().lag_step, OVERLAP)
     return Damage(name, relation.late, f'the clock of {relation.late} or of {relation.early} '
                   f'{judged[0]}, by {relation.words}', judged[1]) if judged else None
 
 
-def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray, least: float) -> list | None:
+def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray, least: float, shared: int = 1
+          ) -> list | None:
     """
     Whether lags (n,) [s] at times (n,) are out of range, step or drift; None if they are valid.
 
     Step and drift are compared with a constant lag by the likelihood of Laplace's distribution,
-    which bears single wrong lags. They must also exceed the change ``least`` [s].
+    which bears single wrong lags. They must also exceed the change ``least`` [s]. ``shared``
+    neighbours are of the same samples and count as one.
 
     Returns:
         cause in words, time of a step or None, function from times to lags.
@@ -140,7 +142,7 @@ def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray, least: float) -
     rests = [np.abs(lags - late(at)).sum() for *_, late in models]
     change, *result = models[int(np.argmin(rests))]
     if abs(change) > least \
-            and usual - min(rests) > shipped().prior * max(min(rests) / n, least / 10):
+            and usual - min(rests) > shared * shipped().prior * max(min(rests) / n, least / 10):
         return result
     if allowed[0] <= middle <= allowed[1]:
         return None
