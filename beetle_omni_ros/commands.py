@@ -304,9 +304,6 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
           skip: Annotated[list[str], Option(metavar='servos|board|ros', help=(
               'Skip a part; may be repeated.'))] = (),
           namespace: options.NamespaceOption = '',
-          timing: Annotated[bool, Option('--timing', help=(
-              'Only measure the cycles of estimator and controllers on this computer; 1 min.'))
-              ] = False,
           json_path: options.JsonOption = None):
     """
     Check ports, devices and clocks of the real robot before flight.
@@ -320,15 +317,12 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
 
     from beetle_omni_ros.drivers.check import run_check
     from beetle_omni_ros.show import page
-    measure = None
-    if timing:
-        from beetle_omni_ros.flight.timing import check_timing as measure
     status = run_check(listen=listen, servo_port=servo_port, board_port=board_port,
                        servo_bus=servo_bus, motor_board=motor_board, robot=robot, seconds=seconds,
-                       skip=tuple(skip), measure=measure, json_path=json_path)
+                       skip=tuple(skip), json_path=json_path)
     page.print_end(page.Terminal(), [json_path],
                    'what the table says, then the same again' if status
-                   else ('check',) if timing or skip
+                   else ('check',) if skip
                    else 'the first flight with hardware, docs/tutorials/hardware_flight.md')
     return status
 

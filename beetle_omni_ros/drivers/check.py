@@ -221,13 +221,12 @@ STYLES = {OK: 'green', WARN: 'yellow', FAIL: 'bold red'}
 def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | None = None,
               board_port: str | None = None, servo_bus: Path | None = None,
               motor_board: Path | None = None, robot: Path | None = None, seconds: float = 3.0,
-              skip: tuple[str, ...] = (), json_path: Path | None = None,
-              measure: Callable[[RobotParameters], Findings] | None = None) -> int:
+              skip: tuple[str, ...] = (), json_path: Path | None = None) -> int:
     """
     Check everything and print a table.
 
     The arguments are the options of `beetle_omni check`. ``listen`` observes the ROS graph for a
-    number of seconds, without ROS it raises ModuleNotFoundError. ``measure`` replaces all parts.
+    number of seconds, without ROS it raises ModuleNotFoundError.
 
     Returns:
         exit status: 0 if nothing failed, else 1.
@@ -246,10 +245,6 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
     bus = replace(bus, port=servo_port or bus.port)
     link = replace(link, port=board_port or link.port)
     graph, found, ros = None, {}, Findings()
-    if measure:
-        skip = PARTS
-        with console.status('replaying a flight in real time'):
-            found['timing'] = measure(robot_parameters)
     if 'ros' not in skip:
         with console.status(f'listening to ROS for {seconds:g} s'):
             graph = _observed(listen, seconds, ros)
