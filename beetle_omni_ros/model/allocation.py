@@ -84,7 +84,6 @@ class Allocation:
 
     tilt: np.ndarray        # (4,) [rad]
     thrust: np.ndarray      # (4,) [N]
-    saturated: np.ndarray   # (4,) bool: at a limit; the wrench is then not met
 
 
 class Allocator:
@@ -141,20 +140,18 @@ class Allocator:
         otherwise noise would turn the joint to the other side.
         """
         pairs = (self._by_force.dot(force) + self._by_torque.dot(torque)).tolist()
-        tilt, thrust, saturated = [], [], []
+        tilt, thrust = [], []
         for along, across, present in zip(pairs[0::2], pairs[1::2],
                                           np.asarray(present_tilt, dtype=float).tolist()):
             length = hypot(along, across)
             if length <= self._negligible:
-                angle, cut = self._inside(present)
+                angle = self._inside(present)
                 length = max(0.0, along * cos(angle) + across * sin(angle))
             else:
-                angle, cut = self._nearest_turn(atan2(across, along), present)
-            held = min(max(length, self._thrust_min), self._thrust_max)
+                angle = self._nearest_turn(atan2(across, along), present)
             tilt.append(angle)
-            thrust.append(held)
-            saturated.append(cut or abs(held - length) > self._negligible)
-        return Allocation(np.array(tilt), np.array(thrust), np.array(saturated))
+            thrust.append(min(max(length, self._thrust_min), self._thrust_max))
+        return Allocation(np.array(tilt), np.array(thrust))
 
     def hover(self, quaternion: np.ndarray, present_tilt: np.ndarray,
               extra_force_world: np.ndarray | None = None,
@@ -179,18 +176,18 @@ class Allocator:
         return np.arctan2(across, along), np.hypot(along, across)
 
     def _nearest_turn(self, angle, present):
-        """Angle + 2 pi k nearest ``present`` inside the travel; (angle, whether limited)."""
+        """Angle + 2 pi k nearest ``present`` inside the travel."""
         turned = angle + 2 * pi * round((present - angle) / (2 * pi))
         if abs(turned) > self.tilt_limit + OVERLAP:
             other = turned - copysign(2 * pi, turned)
             if abs(other) <= self.tilt_limit:
-                return other, False
+                return other
             turned = min(turned, other, key=abs)
         return self._inside(turned)
 
     def _inside(self, angle):
         limit = self.tilt_limit
-        return (angle, False) if abs(angle) <= limit else (copysign(limit, angle), True)
+        return angle if abs(angle) <= limit else copysign(limit, angle)
 
 
 def nearest_turn(angle: np.ndarray, present: np.ndarray) -> np.ndarray:

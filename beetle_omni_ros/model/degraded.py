@@ -31,9 +31,8 @@ from beetle_omni_ros.model.parameters import RobotParameters
 RESIDUAL = 1e-3  # [m/s^2, rad/s^2] below it a wrench counts as met
 # Of the allocation near present tilts: weights of an angular against a linear acceleration [m/rad]
 # and of the distance from target tilts [m/s^2/rad] and thrusts [1/kg], largest distance from the
-# present tilts [rad], Gauss-Newton iterations, and error of the acceleration that counts as
-# saturation [m/s^2].
-TURNING, TILT, THRUST, TILT_REACH, ITERATIONS, MISSED = 1.0, 0.3, 0.05, 0.6, 6, 3.0
+# present tilts [rad], and Gauss-Newton iterations.
+TURNING, TILT, THRUST, TILT_REACH, ITERATIONS = 1.0, 0.3, 0.05, 0.6, 6
 # Of the attitudes to hold: time within which actuators must act [s], rate of the servos under load
 # as a share of their limit, number of compared directions, required margin for flight [m/s^2,
 # rad/s^2], rate of turns of the body [rad/s], time by which the rate is multiplied to give the
@@ -123,9 +122,8 @@ class DegradedAllocator(Allocator):
     def allocate(self, force: np.ndarray, torque: np.ndarray,
                  present_tilt: np.ndarray) -> Allocation:
         """As :meth:`Allocator.allocate`, with the remaining actuators."""
-        components, met = self._within_limits(np.concatenate([force, torque]))
+        components = self._within_limits(np.concatenate([force, torque]))
         tilt, thrust = np.array(present_tilt, dtype=float), np.zeros(ROTORS)
-        cut = np.zeros(ROTORS, dtype=bool)
         for i in range(ROTORS):
             angle, pair = self._health.stuck[i], components[2 * i:2 * i + 2]
             if angle is not None:
@@ -133,12 +131,11 @@ class DegradedAllocator(Allocator):
                 continue
             length = float(np.hypot(*pair))
             if length > self._negligible:
-                tilt[i], cut[i] = self._nearest_turn(float(np.arctan2(pair[1], pair[0])), tilt[i])
+                tilt[i] = self._nearest_turn(float(np.arctan2(pair[1], pair[0])), tilt[i])
                 thrust[i] = length
             else:
-                tilt[i], cut[i] = self._inside(float(tilt[i]))
-        held = clipped(thrust, 0.0, self._thrust_max)
-        return Allocation(tilt, held, cut | (not met))
+                tilt[i] = self._inside(float(tilt[i]))
+        return Allocation(tilt, clipped(thrust, 0.0, self._thrust_max))
 
     def allocate_near(self, force: np.ndarray, torque: np.ndarray, tilt: np.ndarray,
                       aim: Allocation) -> Allocation:
@@ -179,8 +176,7 @@ class DegradedAllocator(Allocator):
             else:
                 break
             z, made, cost = tried, new, new_cost
-        missed = np.linalg.norm(made - wrench) > MISSED
-        return Allocation(z[:ROTORS], z[ROTORS:], np.full(ROTORS, missed))
+        return Allocation(z[:ROTORS], z[ROTORS:])
 
     @staticmethod
     def _made(matrix, z):
@@ -189,7 +185,7 @@ class DegradedAllocator(Allocator):
             + matrix[:, 1::2] @ (z[ROTORS:] * np.sin(z[:ROTORS]))
 
     def _within_limits(self, wrench):
-        """Components (8,) with all rotors within their limit, and whether they meet the wrench."""
+        """Components (8,) with all rotors within their limit."""
         (components,), (used,) = self.components(wrench[None])
         limit = self._thrust_max
         for _ in range(ROTORS):
@@ -203,7 +199,7 @@ class DegradedAllocator(Allocator):
             components = fixed + self._inverse(used) @ (wrench - self.columns @ fixed)
             for i in self.stuck:
                 components[2 * i] = max(components[2 * i], 0.0)
-        return components, self.error(components, wrench) < RESIDUAL
+        return components
 
 
 def bounded_step(jacobian: np.ndarray, error: np.ndarray, weight: np.ndarray,

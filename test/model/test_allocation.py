@@ -27,6 +27,10 @@ def independent_wrench(robot, tilt, thrust):
     return force, torque
 
 
+def at_a_limit(got):
+    return (got.thrust >= ROBOT.rotors.thrust_max).any() or (np.abs(got.tilt) >= LIMIT).any()
+
+
 def random_wrench(rng):
     return rng.normal(size=3) * 12, rng.normal(size=3) * 0.8
 
@@ -39,7 +43,7 @@ def test_allocation_leaves_no_residual_and_respects_the_limits():
         got = ALLOCATOR.allocate(force, torque, rng.uniform(-LIMIT, LIMIT, 4))
         assert np.all(np.abs(got.tilt) <= LIMIT)
         assert np.all((got.thrust >= 0) & (got.thrust <= ROBOT.rotors.thrust_max))
-        if not got.saturated.any():
+        if not at_a_limit(got):
             met += 1
             made = independent_wrench(ROBOT, got.tilt, got.thrust)
             np.testing.assert_allclose(made[0], force, atol=1e-4)
@@ -77,7 +81,6 @@ def test_rotor_without_thrust_keeps_its_present_angle():
     got = ALLOCATOR.allocate(np.zeros(3), np.zeros(3), present)
     np.testing.assert_array_equal(got.tilt, present)
     np.testing.assert_array_equal(got.thrust, np.zeros(4))
-    assert not got.saturated.any()
 
 
 @pytest.mark.parametrize('beyond, stays', [(0.04, True), (0.06, False)])
@@ -90,7 +93,6 @@ def test_a_joint_at_its_stop_stays_there_for_a_tilt_barely_beyond_it(beyond, sta
     got = Allocator(replace(ROBOT, joints=replace(ROBOT.joints, position_limit=stop))).hover(
         on_its_side, present)
     np.testing.assert_allclose(got.tilt, present if stays else tilt, atol=1e-9)
-    assert got.saturated[0] == stays
 
 
 def test_known_effects_of_the_robot_file_are_allocated_for():
