@@ -94,24 +94,23 @@ def names_of(runs: list[Path]) -> list[str]:
     return [f'{name} ({k + 1})' for k, name in enumerate(names)] if runs else []
 
 
-def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterator[Recorded]:
+def read_messages(path: str | Path) -> Iterator[Recorded]:
     """
     Yield the messages of a bag in the order of recording, up to a truncation.
 
     Args:
         path: folder or file, see :func:`bag_files`.
-        warnings: list to which a line is added for each truncated or damaged file.
 
     Raises:
         ParameterError: no such bag, unreadable, or not MCAP.
 
     """
-    for topic, kind, data, received in _recorded(path, warnings):
+    for topic, kind, data, received in _recorded(path, []):
         yield Recorded(topic, kind, data, from_nanoseconds(received))
 
 
 def _recorded(path, warnings):
-    """As :func:`read_messages`, topic, type, data and time [ns]."""
+    """Topic, type, data and time [ns]; ``warnings`` gets a line for each broken file."""
     readable, broken = 0, ''
     for file in bag_files(path):
         count = 0
@@ -131,8 +130,7 @@ def _recorded(path, warnings):
                 kind = f'damaged ({type(error).__name__}: {error})' if stream.read(1) \
                     else 'cut off'
                 broken = f'{file.name}: {kind} after {count} readable messages'
-                if warnings is not None:
-                    warnings.append(broken)
+                warnings.append(broken)
         readable += count
     if broken and not readable:
         raise ParameterError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
@@ -164,13 +162,13 @@ def _messages(stream, topics, schemas, outside=True):
         raise EndOfFile
 
 
-def read_together(path: str | Path, warnings: list[str] | None = None
-                  ) -> Iterator[list[Recorded]]:
+def read_together(path: str | Path, warnings: list[str]) -> Iterator[list[Recorded]]:
     """
     Yield the messages of a bag of one robot by topic, a few seconds at a time.
 
-    Arguments and errors are as in :func:`read_messages`, and a ParameterError reports several
-    robots. Topics are in the order of their first message.
+    ``warnings`` gets a line for each truncated or damaged file. Errors are as in
+    :func:`read_messages`, and a ParameterError reports several robots. Topics are in the order of
+    their first message.
     """
     messages = _recorded(path, warnings)
     spaces: set[str] = set()    # namespaces of robots

@@ -303,13 +303,13 @@ class ControllerHost:
         return '' if away <= reach else (f'{away:.4g} m from the robot, expected at most '
                                          f'{reach:g} m: the reach of the controller')
 
-    def step(self, state: State, target: Target | None = None) -> Command | None:
-        """Command to ``target`` or the target in force; None for a state that is not finite."""
+    def step(self, state: State) -> Command | None:
+        """Command to the target in force; None for a state that is not finite."""
         if not isfinite(sum(sum(part.tolist()) for part in (
                 state.position, state.velocity, state.quaternion, state.angular_velocity,
                 state.tilt, state.tilt_velocity))):
             return None
-        state, target = corrected(state, self._health), target or self.target_in_force
+        state, target = corrected(state, self._health), self.target_in_force
         began = thread_time()   # wall time would include other programs
         try:
             result: Any = self.controller.step(state, target)  # type: ignore[arg-type]

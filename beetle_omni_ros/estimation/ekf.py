@@ -20,8 +20,6 @@ from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.readings import ImuReading, PoseReading
 from beetle_omni_ros.model.rotations import geodesic_angle
 
-__all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuReading', 'PoseReading']
-
 DEAD_RECKONING, LOST = 0.1, 20.0    # [s] without an accepted pose until these states
 WITHOUT_POSES = 0.15        # [s] until markers do not define the attitude; a MoCap has 10 Hz
 LOST_POSITION_STD = 5.0     # [m] of the position, each axis, above which the state is lost

@@ -164,7 +164,7 @@ def run_drive(source: str, *, parameters: Path | None = None, robot: Path | None
         say(driver.where())
         before = driver.time()
         try:
-            for actions in stack.enter_context(closing(SOURCES[source](driver, p, p.poses, say))):
+            for actions in stack.enter_context(closing(SOURCES[source](driver, p, say))):
                 for action in actions:
                     say(driver.execute(action))
                 now = driver.time()
@@ -184,7 +184,7 @@ def _typed(size=4096) -> str | None:
     return os.read(sys.stdin.fileno(), size).decode(errors='replace')
 
 
-def keyboard(driver, p, poses, say):
+def keyboard(driver, p, say):
     """Yield the actions of single keys of a terminal, which does not echo meanwhile."""
     before = termios.tcgetattr(sys.stdin)
     try:
@@ -200,20 +200,20 @@ def keyboard(driver, p, poses, say):
                 if shift:
                     found.append(('shift', shift))
                 elif word:
-                    found.append(drive.parse(word, poses) if word in poses else (word, ()))
+                    found.append(drive.parse(word, p.poses) if word in p.poses else (word, ()))
             yield found
     finally:
         termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 
 
-def joystick(driver, p, poses, say):
+def joystick(driver, p, say):
     """Yield the actions of the topic joy until Ctrl-C."""
     say('joy: sticks move and turn, buttons arm, land, hold, home; Ctrl-C leaves')
     buttons, before = (), driver.time()
     while True:
         found, now = [], driver.time()
         if now - driver.joy_at <= p.joystick_timeout:
-            found += [drive.parse(name, poses)
+            found += [drive.parse(name, p.poses)
                       for name in drive.pressed(buttons, driver.buttons, p)]
             buttons = tuple(driver.buttons)
             way, turn = drive.shift_of_sticks(driver.axes, now - before, p)
@@ -223,7 +223,7 @@ def joystick(driver, p, poses, say):
         yield found
 
 
-def terminal(driver, p, poses, say):
+def terminal(driver, p, say):
     """Yield the actions of lines of standard input; its end acts as `wait` and `quit`."""
     options = f'{drive.HELP}, or the name of a pose'
     say(options)
@@ -238,7 +238,7 @@ def terminal(driver, p, poses, say):
                 break
             line, _, text = text.partition('\n')
             try:
-                action = drive.parse(line, poses)
+                action = drive.parse(line, p.poses)
             except ParameterError as error:
                 say(str(error))
                 continue
@@ -247,7 +247,7 @@ def terminal(driver, p, poses, say):
                 yield found
                 return
             if name == 'help':
-                say(f"{options}: {', '.join(poses)}")
+                say(f"{options}: {', '.join(p.poses)}")
             elif name == 'wait':
                 wait = driver.time(), values[0] if values else None
             elif action is not None:

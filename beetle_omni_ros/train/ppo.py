@@ -36,9 +36,10 @@ class GraphPpo(PPO):
 
     """
 
-    def __init__(self, env: TiltableQuadrotorEnv, parameters: TrainParameters, graphs: bool,
+    def __init__(self, env: TiltableQuadrotorEnv, parameters: TrainParameters,
                  teacher: Path | None = None):
         network, p = parameters.network, parameters.ppo
+        graphs = env.device.type == 'cuda'
         groups, seen = {'actor': ['actor'], 'critic': ['critic']}, env.get_observations()
         actor = FeatureModel(
             seen, groups, 'actor', env.num_actions, output_scale=network.output_scale,

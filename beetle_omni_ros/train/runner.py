@@ -36,7 +36,6 @@ class Runner:
         robot: nominal robot.
         folder: of checkpoints and TensorBoard log; None: nothing is written.
         device: torch device.
-        graphs: whether to capture CUDA graphs and compile; None: on a GPU.
         teacher: checkpoint of a policy to imitate at first.
 
     Attributes:
@@ -45,14 +44,13 @@ class Runner:
     """
 
     def __init__(self, parameters: TrainParameters, robot: RobotParameters,
-                 folder: Path | None = None, device: str = 'cpu', graphs: bool | None = None,
+                 folder: Path | None = None, device: str = 'cpu',
                  teacher: Path | None = None):
         self.parameters, self.folder = parameters, folder
         self._robot_hash = robot_hash(robot)
         torch.manual_seed(parameters.seed)
-        self.env = TiltableQuadrotorEnv(parameters, robot, device, compiled=graphs)
-        self.alg = GraphPpo(self.env, parameters,
-                            device.startswith('cuda') if graphs is None else graphs, teacher)
+        self.env = TiltableQuadrotorEnv(parameters, robot, device)
+        self.alg = GraphPpo(self.env, parameters, teacher)
         self.iteration, self.trained_seconds = 0, 0.0
 
     def apply_schedule(self, part: float) -> None:

@@ -39,7 +39,7 @@ def test_a_bad_line_costs_readings_but_never_gives_a_wrong_one(fault):
         assert bus.link.counts['unanswered'] + bus.link.counts['corrupt'] > 5
         assert bus.link.counts['connections'] == 1
         setattr(emulated.faults, fault, 0.0)
-        until(lambda *now: powered(*now) and np.allclose(emulated.goals, GOAL, atol=COUNT),
+        until(lambda *now: powered(*now) and np.allclose(emulated.drive()[0], GOAL, atol=COUNT),
               bus, GOAL)
 
 
@@ -75,12 +75,12 @@ def test_a_lasting_overload_disables_the_servo_with_a_reason_until_the_service_r
                           and servos[1].kept_off, bus, GOAL)
         assert 'reboot' in servos[1].message
         assert bus.servos[1].recoveries == RECOVERIES
-        assert not emulated.torque_enabled[1] and emulated.torque_enabled[[0, 2, 3]].all()
+        assert emulated.drive()[1] == [True, False, True, True]
         until(lambda readings, _: readings.valid.all(), bus, GOAL)
         emulated.faults.overload = set()
         for _ in range(50):
             tick(bus, GOAL)
-        assert not emulated.torque_enabled[1], 'nobody asked for it'
+        assert not emulated.drive()[1][1], 'nobody asked for it'
         emulated.faults.dropped = 1.0       # as an answer that is late on a busy computer
         bus.reboot(1)
         bus.upkeep()
@@ -100,7 +100,7 @@ def test_expired_watchdogs_are_cleared_and_goals_are_followed_again():
         assert all(servo.expired for servo in emulated.servos)
         assert bus.write_goals(GOAL)
         bus.read()  # answered after the goals
-        assert emulated.goals == pytest.approx(GOAL, abs=COUNT)
+        assert emulated.drive()[0] == pytest.approx(GOAL, abs=COUNT)
         assert not any(servo.expired for servo in emulated.servos)
 
 
@@ -131,15 +131,15 @@ def test_pending_torque_off_is_executed_when_cable_or_servo_are_back():
         emulated.unplug()
         assert not bus.disable()
         emulated.plug()
-        until(lambda *_: not emulated.torque_enabled.any(), bus, GOAL)
+        until(lambda *_: not any(emulated.drive()[1]), bus, GOAL)
         bus.enable()
         emulated.faults.silent = {3}
         assert not bus.disable()
         assert any('torque off is not confirmed' in line and 'id 3' in line
                    for line in bus.take_events())
         emulated.faults.silent = set()
-        assert emulated.torque_enabled.tolist() == [False, False, True, False]
-        until(lambda *_: not emulated.torque_enabled.any(), bus, GOAL)
+        assert emulated.drive()[1] == [False, False, True, False]
+        until(lambda *_: not any(emulated.drive()[1]), bus, GOAL)
         assert any('still had torque' in line for line in bus.take_events())
 
 
@@ -149,7 +149,7 @@ def test_a_restart_in_flight_is_unwrapped_to_the_last_good_angle():
         until(arrived(goal), bus, goal)
         emulated.reboot(0)
         emulated.reboot(1)
-        readings, _ = until(lambda *now: powered(*now) and emulated.torque_enabled.all(),
+        readings, _ = until(lambda *now: powered(*now) and all(emulated.drive()[1]),
                             bus, goal)
         assert readings.position == pytest.approx(goal, abs=0.1)
         assert emulated.servos[0]['Present Position'] < 4096, 'its own count is another'

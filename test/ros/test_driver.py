@@ -107,7 +107,7 @@ def test_sticks_and_buttons_are_actions_until_the_joystick_is_silent():
     p = DriveParameters.load()
     pilot = SimpleNamespace(axes=[0.0] * 8, buttons=[0] * 11, joy_at=5.0, steering=object(),
                             time=lambda: 5.0)
-    actions = driver.joystick(pilot, p, {}, print)
+    actions = driver.joystick(pilot, p, print)
     assert next(actions) == []
     pilot.axes[int(p.axes[0])], pilot.buttons[p.buttons['arm']] = float(p.signs[0]), 1
     pilot.time = lambda: 5.1

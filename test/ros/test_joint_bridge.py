@@ -17,23 +17,23 @@ def test_transitions_switch_port_and_torque_and_commands_move_the_joints(tmp_pat
         assert operator.ask('reboot').message == 'not configured'
         operator.go_to('inactive')
         operator.reaches('waiting: no torque, not activated')
-        assert not emulated.torque_enabled.any()
+        assert not any(emulated.drive()[1])
         operator.go_to('active')
         operator.reaches('ready')
-        assert emulated.torque_enabled.all()
+        assert all(emulated.drive()[1])
         operator.tilt = GOAL
         operator.until(lambda: operator.stands_at(GOAL), 'does not move')
-        assert emulated.goals == pytest.approx(GOAL, abs=COUNT)
+        assert emulated.drive()[0] == pytest.approx(GOAL, abs=COUNT)
         operator.counts('latency', 'count', above=10)
         servo = operator.status('gimbal2').values
         assert servo['id'] == '2' and servo['errors'] == 'none' and servo['torque'] == 'True'
         operator.age = 0.3
         operator.counts('inputs', 'command rejected: stale stamp')
-        assert operator.change('deactivate') and not emulated.torque_enabled.any()
+        assert operator.change('deactivate') and not any(emulated.drive()[1])
         operator.reaches('lost: no torque, deactivated')
         assert operator.change('activate') and not graph.dead()
         graph.stop()
-        assert not emulated.torque_enabled.any()
+        assert not any(emulated.drive()[1])
 
 
 def test_a_composed_bridge_waits_for_its_port_and_its_servos_lose_torque_after_it_is_killed(
@@ -47,10 +47,10 @@ def test_a_composed_bridge_waits_for_its_port_and_its_servos_lose_torque_after_i
             operator.until(lambda: 'gimbal2 (id 2): does not answer' in operator.now)
             emulated.faults.silent = set()
             operator.reaches('ready')
-            assert emulated.torque_enabled.all()
+            assert all(emulated.drive()[1])
             graph.kill(JOINT)       # the guard holds the torque for a landing
-            assert emulated.torque_enabled.all()
-            assert operator.wait(lambda: not emulated.torque_enabled.any(), HOLD + WITHIN)
+            assert all(emulated.drive()[1])
+            assert operator.wait(lambda: not any(emulated.drive()[1]), HOLD + WITHIN)
         log = graph.log(JOINT).read_text()
         assert log.count('no such port') <= 2, 'an attempt a second, but not a line'
         assert 'Traceback' not in log

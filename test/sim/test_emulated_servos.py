@@ -78,8 +78,8 @@ def test_the_sdk_reads_writes_pings_and_receives_errors():
             assert handler.read4ByteTxRx(port, 1, 116) == (value, 0, 0)
         assert handler.write1ByteTxRx(port, 1, 64, 1) == (sdk.COMM_SUCCESS, 0)
         assert handler.write1ByteTxRx(port, 1, 11, 3) == (sdk.COMM_SUCCESS, 7)
-        assert bus.torque_enabled.tolist() == [True, False, False, False]
-        assert bus.goals[0] == pytest.approx((-3 - 2048) * 2 * np.pi / 4096)
+        assert bus.drive()[1] == [True, False, False, False]
+        assert bus.drive()[0][0] == pytest.approx((-3 - 2048) * 2 * np.pi / 4096)
         assert handler.reboot(port, 1) == (0, 0)
         assert handler.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
         time.sleep(0.06)

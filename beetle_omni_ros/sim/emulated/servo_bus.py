@@ -276,22 +276,12 @@ class EmulatedServoBus(Device):
         super().__init__('servo_bus', port, seed)
 
     def drive(self) -> tuple[list[float], list[bool]]:
-        """Goals [rad], and whether motors are powered, at one time."""
+        """Goals [rad], and whether motors are powered; without power a joint is free."""
         with self._lock:
             # Handle received bytes, because the thread may not have been scheduled.
             self._serve(time.monotonic())
             return ([servo.goal for servo in self.servos],
                     [servo.torque for servo in self.servos])
-
-    @property
-    def goals(self) -> np.ndarray:
-        """(n,) goal angles of the joints [rad]."""
-        return np.array(self.drive()[0])
-
-    @property
-    def torque_enabled(self) -> np.ndarray:
-        """(n,) bool: whether a motor is powered; without power the joint is free."""
-        return np.array(self.drive()[1])
 
     def set_state(self, position: np.ndarray, velocity: np.ndarray, effort: np.ndarray):
         """Set the joints' true angles [rad], rates [rad/s] and torques [N m], each (n,)."""
