@@ -1,20 +1,17 @@
-"""The interface between the flight stack and a controller, and the host that steps one."""
+"""The interface between the flight stack and a controller."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import inf, isfinite, sqrt
+from math import inf, sqrt
 from pathlib import Path
 import sysconfig
-from time import thread_time
 import traceback
 from typing import Any, Protocol
 
 import numpy as np
 
-from beetle_omni_ros.model.allocation import ActuatorHealth, ALL_HEALTHY, NO_ZEROS, ROTORS
-from beetle_omni_ros.model.mode import FLYING, Mode
+from beetle_omni_ros.model.allocation import ActuatorHealth, NO_ZEROS
 from beetle_omni_ros.model.rotations import BodyState
 
 AT_REST = np.zeros(3)           # velocity of a pose
@@ -223,120 +220,3 @@ def guidance_of(controller: Controller) -> str:
 def reach_of(controller: Any) -> float:
     """Largest distance to a target of a controller [m]; inf if it has none."""
     return float(getattr(controller, 'reach', inf))
-
-
-class ControllerHost:
-    """
-    Steps one controller for the supervisor.
-
-    Before the first target it holds the pose at which the controller became active. A controller
-    that is not active is stepped too, so that it can take over without a jump. ``took`` gets the
-    CPU time of each step [s], ``report`` the text of each error.
-
-    Attributes:
-        target: target of the operator or the task, or None.
-        override: target of the supervisor, which replaces it, or None.
-        mode: state of the supervisor.
-        errors: number of exceptions; ``error`` is the last one in one line.
-
-    """
-
-    def __init__(self, name: str, controller: Controller,
-                 took: Callable[[float], None] = lambda seconds: None,
-                 report: Callable[[str], None] = lambda text: None):
-        self.controller = controller
-        self.target: Target | None = None
-        self.override: Target | None = None
-        self.errors, self.error = 0, ''
-        self._name, self._took, self._report = name, took, report
-        self._hold: Target | None = None
-        self._position: np.ndarray | None = None
-        self._health = ALL_HEALTHY
-        self.mode = Mode()
-
-    @property
-    def active(self) -> bool:
-        """Whether the controller flies."""
-        return self.mode.controller == self._name
-
-    @property
-    def target_in_force(self) -> Target | None:
-        """Target of the next step; None before the first estimate."""
-        return self.override or self.target or self._hold
-
-    def on_mode(self, mode: Mode, now: float) -> str:
-        """
-        Follow the supervisor; motors that stop reset the controller and its targets.
-
-        Returns:
-            why the target is dropped at the takeover from another controller, or ''.
-
-        """
-        before, self.mode = self.mode, mode
-        if mode.motors_off and before.state != mode.state:
-            self.call('reset')
-            self._hold = self.override = None
-        if not self.active or mode == before or self.target is None:
-            return ''
-        reason = self.too_far(self.target, now)     # accepted for the controller before
-        if reason:
-            self.target = self._hold = None
-        return reason
-
-    def on_health(self, health: ActuatorHealth) -> None:
-        """Take the health of the actuators, for this object and the controller."""
-        self._health = health
-        self.call('set_health', health)
-
-    def on_estimate(self, estimate: BodyState) -> None:
-        """Take the pose of each estimate."""
-        self._position = estimate.position
-        if self.target is None and (self._hold is None or self.mode.state != FLYING):
-            self._hold = PoseTarget(estimate.position, estimate.quaternion, estimate.stamp)
-
-    def too_far(self, target: Target, now: float) -> str:
-        """Why a target at ``now`` [s] is out of reach from the last estimate, or ''."""
-        if self._position is None:
-            return ''
-        away = float(np.linalg.norm(target.at(now).position - self._position))
-        reach = reach_of(self.controller)
-        return '' if away <= reach else (f'{away:.4g} m from the robot, expected at most '
-                                         f'{reach:g} m: the reach of the controller')
-
-    def step(self, state: State) -> Command | None:
-        """Command to the target in force; None for a state that is not finite."""
-        if not isfinite(sum(sum(part.tolist()) for part in (
-                state.position, state.velocity, state.quaternion, state.angular_velocity,
-                state.tilt, state.tilt_velocity))):
-            return None
-        state, target = corrected(state, self._health), self.target_in_force
-        began = thread_time()   # wall time would include other programs
-        try:
-            result: Any = self.controller.step(state, target)  # type: ignore[arg-type]
-        except Exception as error:
-            return self._failed('step', f'raised {error_text(error)}')
-        self._took(thread_time() - began)
-        if isinstance(result, Command) and all(getattr(part, 'shape', None) == (ROTORS,)
-                                               for part in (result.tilt, result.thrust)):
-            return result
-        return self._failed('step', f'returned {str(result)[:100]}, expected a Command with two '
-                            f'arrays of {ROTORS}')
-
-    def call(self, method: str, *arguments: Any) -> Any:
-        """
-        Call another of the controller's methods if it has it; None after an error.
-
-        In a process with other nodes, an exception would end the supervisor, too.
-        """
-        function = getattr(self.controller, method, None)
-        if function is None:
-            return None
-        try:
-            return function(*arguments)
-        except Exception as error:
-            return self._failed(method, f'raised {error_text(error)}')
-
-    def _failed(self, method, text):
-        """Count and report an error; returns None."""
-        self.errors, self.error = self.errors + 1, f"controller '{self._name}': {method} {text}"
-        self._report(self.error)

@@ -274,10 +274,9 @@ class FlightLoop(Loop):
                 self._report(component)
             self.deliver()
         stayed = not (self._crashed or ':' in reference.state or simulator.truth.broken)
-        steppers = [component.stepper for component in self._controllers.values()]
         self._recorder.write_meta({'crashed': not stayed, 'controller_error': '; '.join(
-            f'{stepper.error}, {stepper.errors} times' for stepper in steppers
-            if stepper.errors)})
+            f'{one.error}, {one.errors} times' for one in self._controllers.values()
+            if one.errors)})
         return stayed
 
     def take_off(self) -> None:
@@ -292,7 +291,7 @@ class FlightLoop(Loop):
         asked, supervisor = False, self.supervisor
         while supervisor.state != FLYING:
             self.step()
-            if error := self._controllers[supervisor.active].stepper.error:
+            if error := self._controllers[supervisor.active].error:
                 raise ParameterError(error)
             now = self.simulator.time
             if asked and (now > TAKEOFF_TIMEOUT or supervisor.state == 'disarmed'):

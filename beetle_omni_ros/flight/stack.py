@@ -5,19 +5,31 @@ from dataclasses import replace
 from functools import partial
 import math
 import secrets
+from time import thread_time
 from typing import Any
 
 import numpy as np
 
 from beetle_omni_ros.bags.messages import MessageError
 from beetle_omni_ros.bags.topics import TARGETS
-from beetle_omni_ros.control.base import Controller, ControllerHost, guidance_of, PoseTarget, State
+from beetle_omni_ros.control.base import (
+    Command,
+    Controller,
+    corrected,
+    error_text,
+    guidance_of,
+    PoseTarget,
+    reach_of,
+    State,
+    Target,
+)
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.targets import TargetChecks
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.flight.component import Component, ERROR, IDENTITY, OK, WARN
-from beetle_omni_ros.model.mode import FALLBACK, FLYING, STOPPED
+from beetle_omni_ros.model.allocation import ALL_HEALTHY, ROTORS
+from beetle_omni_ros.model.mode import FALLBACK, FLYING, Mode, STOPPED
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.sim.faults import Schedule
 from beetle_omni_ros.supervisor.interface import Answer, Event, INFO, SupervisorParameters
@@ -68,14 +80,30 @@ CANNOT_BE_FLOWN = 'cannot be flown'     # kind of a refused target
 
 
 class ControllerComponent(Component):
-    """Steps a controller once a period, triggered by the estimate; see ControllerHost."""
+    """
+    Steps a controller once a period, triggered by the estimate.
+
+    Before the first target it holds the pose at which the controller became active. A controller
+    that is not active is stepped too, so that it can take over without a jump.
+
+    Attributes:
+        controller: what it steps.
+        target: target of the operator or the task, or None.
+        override: target of the supervisor, which replaces it, or None.
+        errors: number of the controller's exceptions; ``error`` is the last one in one line.
+
+    """
 
     def __init__(self, name: str, controller: Controller, robot: RobotParameters):
         super().__init__(f'{name}_node')
-        self.stepper = ControllerHost(name, controller, self.took, self._on_error)
-        self._command_topic = f'{name}/command'
+        self.controller, self._mode = controller, Mode()
+        self.target: Target | None = None
+        self.override: Target | None = None
+        self.errors, self.error = 0, ''
+        self._name, self._command_topic = name, f'{name}/command'
         self._checks, self._sensors = TargetChecks(robot), robot.sensors
-        self._joints = self._command = None
+        self._joints = self._command = self._hold = self._position = None
+        self._health = ALL_HEALTHY
         self._last_step, self._quiet_until = -math.inf, -math.inf
         self._reported_errors = 0
         self.writes(self._command_topic)
@@ -85,19 +113,18 @@ class ControllerComponent(Component):
         for topic in TARGETS:
             self.reads(topic, self._on_target, expected=False)
         self.follows('supervisor/state', self._on_mode)
-        self.follows('supervisor/target', partial(setattr, self.stepper, 'override'))
-        self.follows('supervisor/actuators', self.stepper.on_health)
+        self.follows('supervisor/target', partial(setattr, self, 'override'))
+        self.follows('supervisor/actuators', self._on_health)
         self.track_compute(controller.period)
         self.report('controller', self._controller_status)
-
-    def _on_error(self, text):
-        if self.host.elapsed() >= self._quiet_until:
-            self._quiet_until = self.host.elapsed() + REPEAT
-            self.host.log(SEVERE, text)
 
     def _on_joints(self, joints):
         if not np.isnan(joints.position).any():     # a bridge has lost a servo for the moment
             self._joints = joints.corrected(self._sensors)
+
+    def _on_health(self, health):
+        self._health = health
+        self._call('set_health', health)
 
     def _on_target(self, target, published):
         # The age counts at publication: a latched target stays valid for a node that starts
@@ -105,7 +132,7 @@ class ControllerComponent(Component):
         then = None if self.host.simulated or math.isnan(published) else published
         now = self.host.now()
         reason = self._checks.why_not(target, then) or (
-            self.stepper.too_far(target, now) if self.stepper.active else '')
+            self._too_far(target, now) if self._mode.controller == self._name else '')
         if reason:
             raise MessageError(reason, CANNOT_BE_FLOWN)
         if target.stamp == 0.0:     # `ros2 topic pub` sets no stamp: valid from now on
@@ -114,37 +141,95 @@ class ControllerComponent(Component):
             target = replace(target, stamp=now)
         # Latched and volatile copies may overtake each other: the newest stamp counts, except
         # after the clock was set back.
-        old = self.stepper.target
+        old = self.target
         if old is None or not target.stamp < old.stamp <= now:
-            self.stepper.target = target
+            self.target = target
+
+    def _too_far(self, target, now):
+        """Why a target at ``now`` [s] is out of reach from the last estimate, or ''."""
+        if self._position is None:
+            return ''
+        away = float(np.linalg.norm(target.at(now).position - self._position))
+        reach = reach_of(self.controller)
+        return '' if away <= reach else (f'{away:.4g} m from the robot, expected at most '
+                                         f'{reach:g} m: the reach of the controller')
 
     def _on_mode(self, mode):
+        """Follow the supervisor; motors that stop reset the controller and its targets."""
+        before, self._mode = self._mode, mode
         if mode.motors_off:
             self._command = None
-        if reason := self.stepper.on_mode(mode, self.host.now()):
+            if before.state != mode.state:
+                self._call('reset')
+                self._hold = self.override = None
+        if mode.controller != self._name or mode == before or self.target is None:
+            return
+        if reason := self._too_far(self.target, self.host.now()):   # another one's target
+            self.target = self._hold = None
             self.reject('target_pose', f'{reason}; the present pose is held', CANNOT_BE_FLOWN)
 
     def _on_odom(self, odom):
-        stepper = self.stepper
-        stepper.on_estimate(odom)
+        self._position = odom.position
+        if self.target is None and (self._hold is None or self._mode.state != FLYING):
+            self._hold = PoseTarget(odom.position, odom.quaternion, odom.stamp)
         since = odom.stamp - self._last_step        # < 0: the clock was set back
-        if self._joints is None or 0 <= since < stepper.controller.period - STEP_TOLERANCE:
+        if self._joints is None or 0 <= since < self.controller.period - STEP_TOLERANCE:
             return
         self._last_step = odom.stamp
-        command = stepper.step(State.join(odom, self._joints, self._command))
+        command = self._step(State.join(odom, self._joints, self._command))
         if command is not None:
             self.send(self._command_topic, command)
 
+    def _step(self, state):
+        """Command to the target in force; None for a state that is not finite."""
+        if not math.isfinite(sum(sum(part.tolist()) for part in (
+                state.position, state.velocity, state.quaternion, state.angular_velocity,
+                state.tilt, state.tilt_velocity))):
+            return None
+        target = self.override or self.target or self._hold
+        state = corrected(state, self._health)
+        began = thread_time()   # wall time would include other programs
+        try:
+            result = self.controller.step(state, target)
+        except Exception as error:
+            return self._failed('step', f'raised {error_text(error)}')
+        self.took(thread_time() - began)
+        if isinstance(result, Command) and all(getattr(part, 'shape', None) == (ROTORS,)
+                                               for part in (result.tilt, result.thrust)):
+            return result
+        return self._failed('step', f'returned {str(result)[:100]}, expected a Command with two '
+                            f'arrays of {ROTORS}')
+
+    def _call(self, method, *arguments):
+        """
+        Call another of the controller's methods if it has it; None after an error.
+
+        In a process with other nodes, an exception would end the supervisor, too.
+        """
+        function = getattr(self.controller, method, None)
+        if function is None:
+            return None
+        try:
+            return function(*arguments)
+        except Exception as error:
+            return self._failed(method, f'raised {error_text(error)}')
+
+    def _failed(self, method, text):
+        """Count an error and log it; returns None."""
+        self.errors, self.error = self.errors + 1, f"controller '{self._name}': {method} {text}"
+        if self.host.elapsed() >= self._quiet_until:
+            self._quiet_until = self.host.elapsed() + REPEAT
+            self.host.log(SEVERE, self.error)
+
     def _controller_status(self):
-        stepper, controller = self.stepper, self.stepper.controller
-        report = stepper.call('diagnostics') or {}
-        new, self._reported_errors = stepper.errors - self._reported_errors, stepper.errors
-        values = {**report, 'guidance': guidance_of(controller)}
-        if stepper.errors:
-            values['errors'] = stepper.errors
+        report = self._call('diagnostics') or {}
+        new, self._reported_errors = self.errors - self._reported_errors, self.errors
+        values = {**report, 'guidance': guidance_of(self.controller)}
+        if self.errors:
+            values['errors'] = self.errors
         if new:
-            return ERROR, stepper.error, values
-        return OK, getattr(controller, 'name', self.name.removesuffix('_node')), values
+            return ERROR, self.error, values
+        return OK, getattr(self.controller, 'name', self._name), values
 
 
 # --- supervisor ----------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import re
 from desk import Desk
 import numpy as np
 import pytest
-from test_host import Own
+from test_controllers import Own
 
 from beetle_omni_ros.bags.log import Recorder
 from beetle_omni_ros.bags.messages import Wrench
@@ -150,7 +150,7 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(follower):
     stamps = 101 + 0.005 * np.arange(200)
     fly(follower, stamps)
     assert np.allclose(follower.stamps('nmpc/command'), stamps[::2])
-    state = follower.component.stepper.controller.states[-1]
+    state = follower.component.controller.states[-1]
     assert state.tilt == pytest.approx(health.true(np.zeros(4)))
     fly(follower, [95.0, 95.005, 95.01])    # the clock was set back, and the new time is used
     assert len(follower.stamps('nmpc/command')) == 102
@@ -159,7 +159,7 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(follower):
 def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets(follower):
     def target():
         fly(follower, follower.time + 1.0)
-        return follower.component.stepper.controller.targets[-1]
+        return follower.component.controller.targets[-1]
 
     for stamp, x in ((50.0, 1.0), (60.0, 2.0), (50.0, 3.0)):
         aim(follower, x, stamp)
@@ -169,15 +169,15 @@ def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets
     assert target().position[0] == 4.0 and target().stamp == now
     for mode in ('flying:nmpc', 'disarmed'):
         follower.component.feed('supervisor/state', Mode(mode))
-    assert follower.component.stepper.controller.resets == 1
+    assert follower.component.controller.resets == 1
 
 
 def test_a_bad_target_is_refused_with_its_reason_and_the_old_one_stays(follower):
-    stepper = follower.component.stepper
+    component = follower.component
     follower.simulated = False
     fly(follower, 100.0)
     aim(follower, 0.0, 100.0, published=100.0)
-    first = stepper.target
+    first = component.target
     follower.component.feed('supervisor/state', Mode('flying:nmpc'))
     for change, expected in (
             ({'z': -5.0}, 'z = -5 m, expected at least'),
@@ -186,16 +186,16 @@ def test_a_bad_target_is_refused_with_its_reason_and_the_old_one_stays(follower)
             ({'stamp': 200.0}, 's old, expected from -1 to 10 s')):
         aim(follower, **{'x': 0.0, 'stamp': 100.0, 'published': 100.0, **change})
         assert expected in follower.component.inputs['target_pose'].last_refusal
-        assert stepper.target is first
+        assert component.target is first
     assert follower.refused('target_pose') == {'cannot be flown': 4}
     aim(follower, 0.0, 100.8, z=1.4, published=100.0)   # of a clock ahead: valid from now on
-    assert stepper.target.position[2] == 1.4 and stepper.target.stamp == follower.time
+    assert component.target.position[2] == 1.4 and component.target.stamp == follower.time
 
 
 def test_an_exception_of_a_controller_is_logged_once_a_second_and_reported(follower):
     def failing(state, target):
         raise ValueError('too bad')
-    follower.component.stepper.controller.step = failing
+    follower.component.controller.step = failing
     fly(follower, [101.0, 101.1])
     assert len([line for line in follower.lines if 'ValueError: too bad' in line]) == 1
     level, text, values = follower.status('controller')

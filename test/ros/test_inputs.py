@@ -44,18 +44,18 @@ def pose(height=1.0, stamp=0.0, frame='world', x=0.0):
 
 def test_a_target_with_a_wrong_frame_is_refused_and_the_next_one_is_flown(bench):
     node = bench.add(still())
-    poses, stepper = bench.publisher(PoseStamped, 'target_pose'), node.component.stepper
+    poses, component = bench.publisher(PoseStamped, 'target_pose'), node.component
     poses.publish(pose())
-    assert bench.wait(lambda: stepper.target is not None)
-    first, entry = stepper.target, node.component.inputs['target_pose']
+    assert bench.wait(lambda: component.target is not None)
+    first, entry = component.target, component.inputs['target_pose']
     for message, expected in ((pose(-5.0), 'z = -5 m, expected at least'),
                               (pose(frame='map'), "frame_id 'map'")):
         before = entry.rejected.total()
         poses.publish(message)
         assert bench.wait(lambda before=before: entry.rejected.total() > before), expected
-        assert expected in entry.last_refusal and stepper.target is first
+        assert expected in entry.last_refusal and component.target is first
     poses.publish(pose(1.5, time.time(), frame=''))
-    assert bench.wait(lambda: stepper.target.position[2] == 1.5)
+    assert bench.wait(lambda: component.target.position[2] == 1.5)
 
 
 @pytest.fixture
