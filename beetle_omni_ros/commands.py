@@ -78,8 +78,8 @@ def evaluate(controllers: Annotated[str, Option(
              nmpc: options.NmpcOption = None,
              policy: options.PolicyOption = None,
              without: Annotated[str, Option(metavar='LAYER,...', help=(
-                 'Layers of the guidance that are off: unwinding, routing, easing, trimming, or '
-                 'all.'))] = '',
+                 'Layers of the guidance that are off: unwinding, routing, easing, trimming, '
+                 'gravity, or all.'))] = '',
              bag: Annotated[Path | None, Option(metavar='DIR', help=(
                  'New folder for the bag; with several controllers it contains one bag for '
                  'each.'))] = None,

@@ -17,7 +17,8 @@ from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.model import rotations
 from beetle_omni_ros.model.schema import ParameterError, quoted
 
-LAYERS = 'unwinding', 'routing', 'easing', 'trimming'
+# The last one is :mod:`.gravity`.
+LAYERS = 'unwinding', 'routing', 'easing', 'trimming', 'gravity'
 # Unwinding
 ATTEMPTS = 2            # to unwind, for one target
 WOUND = 2.4             # [rad] a joint beyond is wound; hover with a force or payload needs less
@@ -51,7 +52,10 @@ class Guidance:
 
     Args:
         axes: (4, 3) unit tilt axes in base_link.
-        without: layers that are off: names with commas, or 'all'; ``text`` lists the others.
+        without: layers that are off: names with commas, or 'all'.
+
+    Attributes:
+        layers: names of the others; ``text`` lists them.
 
     """
 
@@ -60,8 +64,8 @@ class Guidance:
         if off - {*LAYERS, 'all'}:
             raise ParameterError(f"key 'without': expected {', '.join(LAYERS)} or all, found "
                                  + quoted(without))
-        self._on = [name for name in LAYERS if not off & {name, 'all'}]
-        self.text = ', '.join(self._on) or 'none'
+        self.layers = [name for name in LAYERS if not off & {name, 'all'}]
+        self.text = ', '.join(self.layers) or 'none'
         self._axes = axes
         self.reset()
 
@@ -87,7 +91,7 @@ class Guidance:
             self._take(state, given)
         if self._way:
             self._go_on(state)
-        elif 'unwinding' in self._on and len(self._failed) < ATTEMPTS \
+        elif 'unwinding' in self.layers and len(self._failed) < ATTEMPTS \
                 and self._stuck(state, given):
             self._unwound += 1
             self._until = state.stamp + DURATION
@@ -98,9 +102,9 @@ class Guidance:
             attitude, height, _, _ = self._way[0]
             x, y, z = given.position
             given = replace(given, position=np.array([x, y, max(z, height)]), quaternion=attitude)
-        elif 'trimming' in self._on:
+        elif 'trimming' in self.layers:
             given = self._trimming.target(state, given, in_charge)
-        return self._eased(state, given) if 'easing' in self._on else given
+        return self._eased(state, given) if 'easing' in self.layers else given
 
     def _eased(self, state, shown):
         """The target, nearer at the begin of a move, and higher while the robot dives."""
@@ -127,7 +131,7 @@ class Guidance:
                 or rotations.geodesic_angle(given.quaternion, self._looked) >= ANOTHER:
             self._looked, self._way = given.quaternion, []
             between = route(state.quaternion, given.quaternion, state.tilt, self._axes) \
-                if 'routing' in self._on else None
+                if 'routing' in self.layers else None
             if between is not None:
                 self._routed += 1
                 self._way, self._until = [(between, -inf, NEAR, inf)], state.stamp + DURATION

@@ -7,6 +7,7 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
 from beetle_omni_ros.control.disturbance import DisturbanceEstimator, DisturbanceParameters
+from beetle_omni_ros.control.gravity import ApparentGravity
 from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.matching import ModelMatching
 from beetle_omni_ros.control.policy_file import PolicyNetwork
@@ -68,7 +69,10 @@ class PolicyController:
             # The disturbance of another robot is its difference from that of the training.
             self._estimator = DisturbanceEstimator(
                 trained, DisturbanceParameters(latency=latency), COMMAND_DELAY)
+        self._gravity = ApparentGravity(robot.mass * robot.gravity)
         self._guidance = Guidance(robot.tilt_axes, p.without)
+        # A policy with memory observes the force.
+        self._weighs = 'gravity' in self._guidance.layers and not contract.memory
         self.guidance = self._guidance.text
         self.reset()
 
@@ -76,6 +80,7 @@ class PolicyController:
         """Reset the last commands, the estimate and all counts."""
         self._steps = self._faults = self._cut = 0
         self._guidance.reset()
+        self._gravity.reset()
         self._latest: deque[list[float]] = deque(maxlen=LATEST)
         if self._estimator:
             self._estimator.reset()
@@ -89,17 +94,20 @@ class PolicyController:
             state = self._matching.observed(state)
         if self._estimator:
             state = self._estimator.ahead(state)
+            if self._weighs:
+                self._gravity.update(self._estimator.disturbance[:3])
+        scale = [1.0] * 4 + [self._gravity.scale] * 4
         command = state.command
         executed = command and command.tilt.tolist() + command.thrust.tolist()
         if isinstance(target, PoseTarget):      # in charge: the executed command is a latest one
             target = self._guidance.target(state, target, executed in self._latest)
         before = executed or state.tilt.tolist() + self._hover
-        observation = observed(state, target.at(state.stamp), [
-            (v - o) / s for v, o, s in zip(before, self._offset, self._scale)])
+        observation = observed(*self._gravity.seen(state, target.at(state.stamp)), [
+            (v / g - o) / s for v, g, o, s in zip(before, scale, self._offset, self._scale)])
         if self._estimator and self.contract.memory:
             observation += disturbed(state, self._estimator.disturbance)
         action = self.network(observation)
-        values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
+        values = [g * (s * a + o) for a, g, o, s in zip(action, scale, self._offset, self._scale)]
         if not all(low <= v <= high for v, (low, high) in zip(values, self._limits)):
             if all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):     # false for NaN
                 values = [min(max(v, low), high) for v, (low, high) in zip(values, self._limits)]

@@ -215,10 +215,10 @@ def test_the_target_is_higher_while_the_robot_dives_at_first(stamp, height, spee
 
 
 def test_layers_that_are_off_do_not_act_and_are_not_in_the_description():
-    assert Guidance(AXES).text == 'unwinding, routing, easing, trimming'
-    assert Guidance(AXES, 'trimming, routing').text == 'unwinding, easing'
+    assert Guidance(AXES).text == 'unwinding, routing, easing, trimming, gravity'
+    assert Guidance(AXES, 'trimming, routing').text == 'unwinding, easing, gravity'
     bare = Guidance(AXES, 'all')
     assert bare.text == 'none' and fly(bare, 2.0)[-1] is TARGET
     assert bare.target(wound_state(), inverted(END)).quaternion is END
-    with pytest.raises(ParameterError, match=r"'without'.*trimming or all, found 'turning'"):
+    with pytest.raises(ParameterError, match=r"'without'.*gravity or all, found 'turning'"):
         Guidance(AXES, 'turning')
