@@ -246,6 +246,15 @@ class TableFlight:
                          zi=ramp * command[:1])[0]
         return lagged, (command - lagged) / tau
 
+    def ranges(self) -> str:
+        """What decides whether it flies, in words."""
+        total, weight = self._thrust({})[0].sum(axis=1), self.robot.mass * self.robot.gravity
+        height = self.motion['position'][:, 2]
+        return (f'heights are {height.min():.3g} to {height.max():.3g} m, '
+                if 'position' in self.table.values else '') + (
+            f'thrusts {np.quantile(total, 0.01) / weight:.2g} to '
+            f'{np.quantile(total, 0.99) / weight:.2g} of the weight')
+
     @property
     def usable(self) -> bool:
         """Whether it has a block of samples in the air."""

@@ -259,15 +259,15 @@ def judged_tables(flights: Sequence[TableFlight], judging: Sequence[TableFlight]
             flight.without(COMPARED, flight.apart)
     groups = _groups(flights[0] if not usable else usable[0], declared)
     if not usable:
-        return result_of('bad_data', groups, 'No flight can be used: '
-                         f'{flights[0].name} has no block of commands and measurements in the air')
+        return result_of('bad_data', groups, f'No flight can be used: {flights[0].name} has no '
+                         f'block of commands and measurements in the air: {flights[0].ranges()}')
     for flight in [*usable, *judging]:
         if flight.usable and flight.channels != usable[0].channels:
             raise ParameterError(f'{flight.name}: its channels are '
                                  f"{', '.join(flight.channels)}, expected those of "
                                  f"{usable[0].name}: {', '.join(usable[0].channels)}")
-    findings = [f'{flight.name}: not used, no block of commands and measurements in the air'
-                for flight in [*flights, *judging] if not flight.usable] + [
+    findings = [f'{flight.name}: not used, no block of commands and measurements in the air: '
+                + flight.ranges() for flight in [*flights, *judging] if not flight.usable] + [
         f'{flight.name}: {flight.apart}, so they are not compared'
         for flight in [*flights, *judging] if flight.apart]
     engine, keys = _engine(usable, robot, p, declared, alpha)

@@ -1,10 +1,11 @@
-"""Whether gyroscope and attitude of tables turn together as their format declares them."""
+"""Whether the sensors of tables agree as their format declares them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import wilcoxon
 
 from beetle_omni_ros.identify.recording.series import (
@@ -19,6 +20,7 @@ from beetle_omni_ros.identify.recording.table import (
     columns_of,
     Format,
     FRAMES,
+    G,
     ORDERS,
     SIGNALS,
     Table,
@@ -26,14 +28,18 @@ from beetle_omni_ros.identify.recording.table import (
 )
 from beetle_omni_ros.model.schema import ParameterError
 
+STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
 LEVEL = 1e-3        # probability at which another declaration fits better by chance
 QUIET = 0.005       # [rad/s] errors of a small gyroscope, below which no difference counts
 READINGS = 'quaternion', 'angular_velocity'
+UNLIKE = -np.log(4)     # difference of two series over both; noise of small ones leaves a tenth
+# A mean that differs by more, of gravity, is no bias or scale, and no change of speed in the time [s].
+WEIGHED, LONG = 0.5, 4.0
 
 
 def read_tables(paths: Sequence[Path], form: Format) -> list[Table]:
     """
-    Read flights of one format; refuse one that their gyroscopes contradict.
+    Read flights of one format; refuse one that their sensors contradict.
 
     Raises:
         LogError, ParameterError: unusable file; key of the format, its value and the expected one.
@@ -41,6 +47,8 @@ def read_tables(paths: Sequence[Path], form: Format) -> list[Table]:
     """
     columns = [columns_of(path, form) for path in paths]
     tables = [table_of(path, own, form) for path, own in zip(paths, columns, strict=True)]
+    for table in tables:
+        _check_gravity(table)
     if not tables or not set(READINGS) <= set(form.signals):
         return tables
     declared = np.concatenate([differences(table) for table in tables])
@@ -52,13 +60,40 @@ def read_tables(paths: Sequence[Path], form: Format) -> list[Table]:
         if len(gain) and wilcoxon(
                 gain, zero_method='zsplit', alternative='greater').pvalue < LEVEL:
             before, after = (1e3 * np.sqrt(np.median(x[:, 0])) for x in (declared, tried))
+            text = f"the gyroscope differs by {before:.1f} mrad/s from the turning of 'quaternion'"
             found.append((float(np.median(gain)), (
-                f"key '{key}.{what}': expected {other!r}, found {now!r}: the gyroscope differs by "
-                f"{before:.1f} mrad/s from the turning of 'quaternion', with {other!r} by "
-                f'{after:.1f} mrad/s')))
+                f"key '{key}.{what}': expected {other!r}, found {now!r}: {text}, with {other!r} "
+                f'by {after:.1f} mrad/s') if np.median(_disagreement(tried)) < UNLIKE else (
+                f'{text}, and no other order, frame or unit agrees: check signs, axes and time')))
     if found:
         raise ParameterError(f'--format {form.name}: {max(found)[1]}')
     return tables
+
+
+def _check_gravity(table):
+    """
+    Refuse an accelerometer whose mean in world is not gravity, in unit, sign or axes.
+
+    Without attitude, or where an axis is not recorded, the median of its size is compared.
+    """
+    felt = table.values.get('specific_force')
+    if felt is None or len(table) * table.period < LONG or not np.isfinite(felt).any():
+        return
+    known = np.isfinite(felt).all(axis=1)
+    if known.any() and 'quaternion' in table.values:
+        turn, there = filled(aligned(table.values['quaternion']), table.period)
+        known &= there
+        mean = Rotation.from_quat(turn[known]).apply(felt[known]).mean(axis=0) \
+            if known.any() else G * STRAIGHT_UP
+        wrong, text = mean - G * STRAIGHT_UP, 'its mean in world is ' + ', '.join(
+            f'{x:.3g}' for x in mean) + f' m/s^2, expected about 0, 0, {G:.3g}'
+    else:
+        size = float(np.nanmedian(np.linalg.norm(np.nan_to_num(felt), axis=1)[
+            np.isfinite(felt).any(axis=1)]))
+        wrong, text = size - G, f'its size is {size:.3g} m/s^2, expected about {G:.3g}'
+    if np.linalg.norm(wrong) > WEIGHED * G:
+        raise ParameterError(f"--format {table.format.name}: key 'specific_force': {text}, in "
+                             f'{table.name}: another unit, sign or axis')
 
 
 def _disagreement(powers):

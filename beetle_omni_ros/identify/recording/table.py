@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from beetle_omni_ros.identify.recording.parameters import shipped
 from beetle_omni_ros.model.files import LogError, read_table
 from beetle_omni_ros.model.resources import share_path
 from beetle_omni_ros.model.schema import (
@@ -172,7 +173,7 @@ def table_of(path: Path, columns: dict[str, np.ndarray], form: Format) -> Table:
     a point without row are samples that do not exist.
 
     Raises:
-        LogError: no increasing times.
+        LogError: no increasing times, or not those of a flight.
 
     """
     count, values = len(next(iter(columns.values()))), {}
@@ -190,7 +191,10 @@ def table_of(path: Path, columns: dict[str, np.ndarray], form: Format) -> Table:
     if len(t) < 10 or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
         raise LogError(f'{path}: column {form.signals["time"].columns[0]!r}: expected at least 10 '
                        'increasing times without empty cells')
-    period = float(np.median(np.diff(t)))
+    period, (low, high) = float(np.median(np.diff(t))), shipped().period
+    if not low <= period <= high:
+        raise LogError(f"{path}: rows are {period:g} s apart, expected {low:g} to {high:g} s: key "
+                       f"'time.unit' of the format {form.name}?")
     place = np.rint((t - t[0]) / period).astype(int)
     on_grid = {}
     for name, block in values.items():
