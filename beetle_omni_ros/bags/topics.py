@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from beetle_omni_ros.bags import conversions as form
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.model.schema import unknown
 
 
 class Qos(NamedTuple):
@@ -130,6 +131,8 @@ def controller_of(name: str) -> str:
 
 
 def topic_of(name: str) -> Topic:
-    """Return the topic of a name without namespace; KeyError for an unknown one."""
+    """Return the topic of a name without namespace; ParameterError for an unknown one."""
     controller = controller_of(name)
-    return command_topic(controller) if controller and name not in ALL else ALL[name]
+    if name not in ALL and not controller:
+        raise unknown(f"topic '{name}'", 'topic', name, ALL)
+    return ALL[name] if name in ALL else command_topic(controller)

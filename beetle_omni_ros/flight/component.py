@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from beetle_omni_ros.bags.messages import Diagnostic, MessageError
-from beetle_omni_ros.bags.topics import Qos
+from beetle_omni_ros.bags.topics import Qos, topic_of
 from beetle_omni_ros.control.base import error_text
 from beetle_omni_ros.control.registry import loaded, snake_case
 from beetle_omni_ros.model.parameters import RobotParameters
@@ -360,7 +360,8 @@ def made(references: Iterable[str], robot: RobotParameters) -> list[Component]:
     Components of references; their topics are those of the table or registered ones.
 
     Raises:
-        ParameterError: see :func:`component_class`, or the constructor raised an exception.
+        ParameterError: see :func:`component_class`; the constructor raised an exception; unknown
+            topic.
 
     """
     components = []
@@ -372,4 +373,6 @@ def made(references: Iterable[str], robot: RobotParameters) -> list[Component]:
         except Exception as error:
             raise ParameterError(f"component '{reference}': building it raised "
                                  f'{error_text(error)}') from error
+        for topic in (*components[-1].inputs, *components[-1].outputs):
+            topic_of(topic)
     return components

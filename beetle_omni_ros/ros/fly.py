@@ -53,7 +53,9 @@ PACING = 'sim_node: pacing'
 SUPERVISOR_STATUS = f'{SUPERVISOR}: supervisor'
 LATE = 'stale stamp', 'estimates_late', 'commands_late'     # in the names of its values
 SLOW = 'this computer was too slow'
-ADVICE = 'try --clock simulated'
+# By the actuators; emulated ones need real time.
+ADVICE = {'direct': 'try --clock simulated',
+          'emulated': 'close other programs, or try --actuators direct'}
 FILM = 'flight.html'        # of --view, in the folder of the bag
 
 
@@ -150,10 +152,11 @@ def _conclude(graph, bag, task, meta, failure, slow, json_path, console, full, f
             failure = failure or failed(result)
         if 'interrupted' in meta:
             raise KeyboardInterrupt
+        slow = slow and f"{slow}: {ADVICE[meta['actuators']]}"
         if failure:
-            _complain('; '.join(filter(None, (failure, slow and f'{slow}: {ADVICE}'))))
+            _complain('; '.join(filter(None, (failure, slow))))
         elif slow:
-            _print(console, f'{slow}: {ADVICE}', style='yellow')
+            _print(console, slow, style='yellow')
     finally:
         page = bag / FILM
         print_end(console, [bag, log, *([page] if page.exists() else []), json_path],

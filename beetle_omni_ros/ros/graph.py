@@ -23,7 +23,7 @@ import yaml
 
 import beetle_omni_ros
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.flight.component import component_class, node_name
+from beetle_omni_ros.flight.component import made, node_name
 from beetle_omni_ros.model.parameters import RobotParameters
 from beetle_omni_ros.model.schema import ParameterError, RunError
 
@@ -124,7 +124,8 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
         Node name -> parameters; omitted standby controller -> reason.
 
     Raises:
-        ParameterError: the active controller is unusable, or the clock does not fit the actuators.
+        ParameterError: the active controller or a component is unusable, or the clock does not fit
+            the actuators.
 
     """
     actuators = actuators or ('direct' if clock == 'simulated' else 'emulated')
@@ -148,8 +149,9 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
         *((name, True, values) for name, values in controllers.items()),
         ('supervisor_node', True, {**robot, 'controller': active, **others}),
         ('reference_node', task, {'task': task, 'seed': seed}),
-        *((node_name(component_class(reference)), True, {'component': reference, **robot})
-          for reference in components),
+        *((node_name(type(component)), True, {'component': reference, **robot})
+          for component, reference in zip(made(
+              components, RobotParameters.load(robot_file or None)), components, strict=True)),
         ('viewer_node', viewer, {}),
         # After the controllers, whose start would keep its emulated devices from answering.
         ('sim_node', simulated, {**plant, 'conditions': conditions, 'seed': seed,

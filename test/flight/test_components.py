@@ -331,7 +331,8 @@ def test_a_class_that_is_no_component_is_refused(tmp_path):
 @pytest.mark.parametrize('line, error', [
     ('1 / 0', r'a component raised ZeroDivisionError: division by zero \(own.py:9\)'),
     ("self.send('battery_state', 1.0)", "topic 'battery_state': expected a Battery.*, found"),
-    ('', r"component '.*own.py:Own': building it raised NameError: .*\(own.py:6\)")])
+    ('', r"component '.*own.py:Own': building it raised NameError: .*\(own.py:6\)"),
+    ("self.reads('odoom', None)", "topic 'odoom': unknown topic; did you mean 'odom'")])
 def test_a_mistake_in_a_component_is_one_line_with_its_place(tmp_path, line, error):
     file = tmp_path / 'own.py'
     file.write_text(f"""from beetle_omni_ros.flight.component import Component
@@ -339,7 +340,7 @@ def test_a_mistake_in_a_component_is_one_line_with_its_place(tmp_path, line, err
 class Own(Component):
     def __init__(self, robot):
         super().__init__('own_node')
-        {'' if line else 'nothing'}
+        {line if 'reads' in line else '' if line else 'nothing'}
         self.reads('imu/data_raw', self._take)
     def _take(self, sample):
         {line or 'pass'}

@@ -32,8 +32,9 @@ def flight(tmp_path):
         path = tmp_path / f'{seed}.csv'
         np.savetxt(path, np.column_stack([
             t[:-1], late + 2e-4 * rng.normal(size=late.shape),
-            rate + 0.01 * rng.normal(size=rate.shape), force + 0.3 * rng.normal(size=force.shape)]),
-            delimiter=',', fmt='%.7g', comments='', header='t,qx,qy,qz,qw,wx,wy,wz,fx,fy,fz')
+            rate + 0.01 * rng.normal(size=rate.shape),
+            force + 0.3 * rng.normal(size=force.shape)]), delimiter=',', fmt='%.7g',
+            comments='', header='t,qx,qy,qz,qw,wx,wy,wz,fx,fy,fz')
         return path
     return write
 

@@ -15,6 +15,7 @@ from beetle_omni_ros.identify.flights.body import BodyModel
 from beetle_omni_ros.identify.flights.command import gap_results
 from beetle_omni_ros.identify.flights.keys import all_keys, entries_of, extra_keys
 from beetle_omni_ros.identify.flights.treatment import TREATMENTS
+from beetle_omni_ros.identify.flights.verdict import searched_torques
 from beetle_omni_ros.model.effects import CATALOGUE, ignored
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs/how-to/add_an_effect.md'
@@ -66,6 +67,10 @@ def test_the_gap_finder_identifies_the_added_effect(name, values, value):
     entry, = entries_of({n: own for n, own in keys.items() if own.effect == name and not own.form})
     assert entry.keys[0] == key and set(entry.keys) == {
         f'{name}.{parameter}' for parameter in CATALOGUE[name].numbers}
+
+
+def test_tables_show_an_added_effect_but_none_with_a_state():
+    assert HEAT in searched_torques() and WARMING not in searched_torques()
 
 
 def test_an_effect_without_a_treatment_acts_as_the_file_has_it(monkeypatch):

@@ -71,6 +71,7 @@ IMU = 'imu_accelerometer_bias', 'imu_misalignment', 'imu_lever_arm'
 OTHERS = ('mass', 'thrust_coefficient', 'ground_effect', 'rotor_drag', 'body_drag',
           'axial_inflow', 'translational_lift', 'wind', 'wind_velocity', 'voltage_sag',
           'formula', *LAGS, *IMU, 'imu_gyroscope_bias', 'mocap_misalignment')
+JOINTED = 'module_reaction', 'tilt_thrust_loss'     # which fixed tilts do not show
 # What shows entries of tables: begins of names of signals and channels, one of which is there.
 SHOWN_BY = (
     (('torque_',), TORQUES), (('voltage',), ('voltage_sag',)),
@@ -202,11 +203,20 @@ def _delays(robot, p, coarse):
     return [{name: own[k] for name, own in delays.items()} for k in range(2)]
 
 
-def _engine(flights, robot, p, declared, alpha, torques=TORQUES):
+def searched_torques() -> tuple[str, ...]:
+    """Entries of tables that torques may show, with those that others have added."""
+    known = {*TORQUES, *OTHERS, *JOINTED}
+    return *TORQUES, *(name for name, effect in CATALOGUE.items() if name in TREATMENTS
+                       and effect.apply and not effect.rate and name not in known
+                       and effect.layer in ('body', 'rotor'))
+
+
+def _engine(flights, robot, p, declared, alpha, torques=None):
     """Engine of flights of tables with the entries that channels and signals can show."""
     there = *flights[0].channels, *declared.signals
-    names = {*OTHERS, *torques}.difference(*(hidden for needed, hidden in SHOWN_BY if not any(
-        name.startswith(needed) for name in there)))
+    names = {*OTHERS, *(torques or searched_torques())}.difference(*(
+        hidden for needed, hidden in SHOWN_BY
+        if not any(name.startswith(needed) for name in there)))
     if by_mocap(declared.signals):
         names = names - {*IMU} | {'mocap_misalignment'}
     keys = keys_of(robot, names - set(p.without))
@@ -238,7 +248,7 @@ def load_tables(paths: Sequence[Path], robot: RobotParameters, declared: Format
     """
     if not {'duty', 'thrust'} & set(declared.signals):
         raise ParameterError(f"--format {declared.name}: expected the key 'duty' or 'thrust'")
-    keys = keys_of(robot, {*OTHERS, *TORQUES})
+    keys = keys_of(robot, {*OTHERS, *searched_torques()})
     body = BodyModel(robot, {**all_keys(robot), **extra_keys(robot)}, tilting_modules(robot))
     return [TableFlight(table, robot, body, keys) for table in read_tables(paths, declared)]
 

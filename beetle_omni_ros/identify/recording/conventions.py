@@ -33,7 +33,8 @@ LEVEL = 1e-3        # probability at which another declaration fits better by ch
 QUIET = 0.005       # [rad/s] errors of a small gyroscope, below which no difference counts
 READINGS = 'quaternion', 'angular_velocity'
 UNLIKE = -np.log(4)     # difference of two series over both; noise of small ones leaves a tenth
-# A mean that differs by more, of gravity, is no bias or scale, and no change of speed in the time [s].
+# A mean that differs by more, of gravity, is no bias or scale, and no change of speed in that
+# time [s].
 WEIGHED, LONG = 0.5, 4.0
 
 
