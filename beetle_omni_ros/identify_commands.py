@@ -29,7 +29,7 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
             'positions, as fitted within tolerance.'))] = False,
         form: Annotated[str | None, Option('--format', metavar='NAME|FILE', help=(
             'Flights are tables (CSV, .gz) with the columns of this format: nanobench, '
-            'crazypad_motor, neural_fly, neural_swarm, or a YAML file.'))] = None,
+            'crazypad_motor, crazyflie_usd, neural_fly, neural_swarm, or a YAML file.'))] = None,
         alpha: Annotated[float, Option(metavar='P', help=(
             'Accepted probability of a false alarm.'))] = 0.05,
         next_task: Annotated[Path | None, Option(

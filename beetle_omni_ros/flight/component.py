@@ -240,7 +240,10 @@ class Component:
         entry.age, entry.seen = age, host.elapsed()
 
     def send(self, topic: str, value: Any, source: str = '') -> None:
-        """Publish a value."""
+        """Publish a value of a topic that it writes."""
+        if topic not in self.outputs:
+            raise ParameterError(f"{self.name}: sends '{topic}', expected one that it writes: "
+                                 + (', '.join(self.outputs) or 'none'))
         self.host.publish(topic, value, source)
 
     def update(self, topic: str, value: Any) -> bool:

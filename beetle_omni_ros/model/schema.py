@@ -226,8 +226,9 @@ def numbers(value: Any, at: str, spec: Mapping[str, Any]) -> np.ndarray:
         if not np.isfinite(number):
             raise ParameterError(f'{at}: {number} is not finite')
         if not low <= number <= high:
+            unit = spec['unit'] if spec['unit'] != '1' else ''
             raise ParameterError(
-                f"{at}: {number:g} is outside {low:g} to {high:g} {spec['unit']}".rstrip())
+                f'{at}: {number:g} is outside {low:g} to {high:g} {unit}'.rstrip())
     return array
 
 

@@ -151,7 +151,7 @@ def load_cases(path: str | Path | None = None) -> dict[str, Case]:
     cases = {}
     for name, entry in bind(file, load_yaml(path), str(path)).faults.items():
         case = bind(Case, entry | {'name': name} if isinstance(entry, dict) else entry, str(path),
-                    f'faults.{name}')
+                    f'faults.{name}.')
         cases[name] = replace(case, strike=tuple(
             _fault(one, f"{path}: key 'faults.{name}': strike {k}")
             for k, one in enumerate(case.strike, 1)))

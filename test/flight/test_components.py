@@ -330,7 +330,9 @@ def test_a_class_that_is_no_component_is_refused(tmp_path):
 
 @pytest.mark.parametrize('line, error', [
     ('1 / 0', r'a component raised ZeroDivisionError: division by zero \(own.py:9\)'),
-    ("self.send('battery_state', 1.0)", "topic 'battery_state': expected a Battery.*, found"),
+    ("self.send('battery_state', 1.0)", "own_node: sends 'battery_state', expected one that"),
+    ("self.writes('battery_state') or self.send('battery_state', 1.0)",
+     "topic 'battery_state': expected a Battery.*, found"),
     ('', r"component '.*own.py:Own': building it raised NameError: .*\(own.py:6\)"),
     ("self.reads('odoom', None)", "topic 'odoom': unknown topic; did you mean 'odom'")])
 def test_a_mistake_in_a_component_is_one_line_with_its_place(tmp_path, line, error):

@@ -146,9 +146,11 @@ def test_warnings_are_in_the_order_of_time_each_once(tmp_path):
                                 '[WARN] [25.0] [b]: id 2: old, 7.5 ms']
 
 
-@pytest.mark.parametrize('speed', [0.3, 3.0])
-def test_a_fall_in_the_landing_is_the_last_line_with_its_likely_cause(tmp_path, monkeypatch,
-                                                                      capfd, speed):
+@pytest.mark.parametrize('speed, actuators, advice', [
+    (0.3, 'direct', 'try --clock simulated'),
+    (3.0, 'emulated', 'close other programs, or try --actuators direct')])
+def test_a_fall_in_the_landing_is_the_last_line_with_its_likely_cause(
+        tmp_path, monkeypatch, capfd, speed, actuators, advice):
     bag = tmp_path / 'bag'
 
     def flown(graph, controller, task, *_):
@@ -161,14 +163,14 @@ def test_a_fall_in_the_landing_is_the_last_line_with_its_likely_cause(tmp_path, 
         return '', 'this computer was too slow'
 
     monkeypatch.setattr(fly_module, '_fly', flown)
-    assert fly_module.run_fly(task='random1', bag=bag, clock='system', standby=False) \
-        == (speed > 1)
+    assert fly_module.run_fly(task='random1', bag=bag, clock='system', standby=False,
+                              actuators=actuators) == (speed > 1)
     out, err = capfd.readouterr()
     if speed > 1:
         assert err == ('beetle_omni fly: error: the robot fell in the landing; this computer was '
-                       'too slow: try --clock simulated\n')
+                       f'too slow: {advice}\n')
     else:
-        assert not err and '\nthis computer was too slow: try --clock simulated\nfiles: ' in out
+        assert not err and f'\nthis computer was too slow: {advice}\nfiles: ' in out
     assert 'landing [m/s]' in out
 
 
