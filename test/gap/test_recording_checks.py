@@ -334,7 +334,7 @@ def test_rests_on_the_ground_are_neither_damage_nor_flight(before, after):
     assert error.value.problems[0].at_s == pytest.approx(before + 10, abs=0.1)
 
 
-def test_overlapping_windows_of_one_motion_make_no_step_of_a_clock():
+def test_windows_of_one_motion_make_no_step_of_a_clock():
     at, steady = np.arange(30.0), np.random.default_rng(0).normal(0.1, 0.006, 30)
     last, half = steady.copy(), np.where(at < 15, steady, steady + 0.12)
     last[-3:] = -0.07, -0.015, 0.07      # a hover in gusts, 3 of 6 windows that share samples

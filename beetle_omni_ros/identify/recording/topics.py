@@ -106,7 +106,9 @@ def lag_damage(name: str, relation: Relation, signals: Smoothed) -> Damage | Non
     """A lag of two motions that is out of range, steps or drifts."""
     late, early = (np.linalg.norm(x, axis=1) for x in relation.pair(signals))
     at, lags = window_lags(signals.t, late, early, signals.silent)
-    judged = judge(at, lags, getattr(shipped(), relation.lag), shipped().lag_step, OVERLAP)
+    # the lag of a servo depends on its motion, so that windows of one motion are one observation
+    judged = judge(at, lags, getattr(shipped(), relation.lag), shipped().lag_step,
+                   OVERLAP if relation.early == COMMAND else 1)
     return Damage(name, relation.late, f'the clock of {relation.late} or of {relation.early} '
                   f'{judged[0]}, by {relation.words}', judged[1]) if judged else None
 
@@ -118,7 +120,7 @@ def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray, least: float, s
 
     Step and drift are compared with a constant lag by the likelihood of Laplace's distribution,
     which bears single wrong lags. They must also exceed the change ``least`` [s]. ``shared``
-    neighbours are of the same samples and count as one.
+    neighbours are of one motion and count as one.
 
     Returns:
         cause in words, time of a step or None, function from times to lags.
