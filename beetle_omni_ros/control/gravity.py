@@ -17,7 +17,7 @@ from beetle_omni_ros.model import rotations
 # ones are a part of gravity entirely.
 LEAVE, TAKE = 0.17, 0.5
 SWITCH = 0.1            # the sum points up if it does by this; a sum of twice this has a direction
-LEAST_SCALE = 0.5       # of thrusts; with 0.25 they turn the robot too slowly
+LEAST_SCALE = 0.5       # of thrusts; with 0.25 a force of 40 N was lost
 OVER = np.array([1.0, 0.0, 0.0, 0.0])       # half a turn about x
 
 

@@ -162,7 +162,7 @@ class NmpcController:
                              tilt_rate * p.horizon / -np.expm1(-p.horizon / servo_lag)]
         self._health, self._bounds = ALL_HEALTHY, self._all_bounds
         # Plan and disturbance estimate do what the other layers do.
-        self._guidance = Guidance(robot.tilt_axes, f'{p.without},routing,easing,trimming')
+        self._guidance = Guidance(robot.tilt_axes, f'{p.without},routing,easing,trimming,gravity')
         self.guidance = self._guidance.text
         self.reset()
 

@@ -70,9 +70,10 @@ class PolicyController:
             self._estimator = DisturbanceEstimator(
                 trained, DisturbanceParameters(latency=latency), COMMAND_DELAY)
         self._gravity = ApparentGravity(robot.mass * robot.gravity)
-        self._guidance = Guidance(robot.tilt_axes, p.without)
-        # A policy with memory observes the force.
-        self._weighs = 'gravity' in self._guidance.layers and not contract.memory
+        # A policy with memory observes the force, and model matching has another estimate.
+        without = p.without + ',gravity' * (contract.memory or not self._estimator)
+        self._guidance = Guidance(robot.tilt_axes, without)
+        self._weighs = 'gravity' in self._guidance.layers
         self.guidance = self._guidance.text
         self.reset()
 

@@ -6,10 +6,13 @@ from scipy.spatial.transform import Rotation
 from test_policy import drawn
 
 import beetle_omni_ros
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.gravity import ApparentGravity, LEAST_SCALE
 from beetle_omni_ros.control.policy import observed
+from beetle_omni_ros.model.parameters import RobotParameters
 
-WEIGHT = 30.0
+ROBOT, WEIGHT = RobotParameters.load(), 30.0
 
 
 def seen_up(gravity):
@@ -68,3 +71,10 @@ def test_the_policy_holds_a_force_of_more_than_twice_its_weight():
     flown = beetle_omni_ros.evaluate(['rl', 'rl_bare'], 'force', quiet=True)
     held = {name: flown[name]['force']['withstood_N'] for name in ('rl', 'rl_bare')}
     assert held['rl_bare'] < 40.0 and held['rl'] >= 70.0
+
+
+def test_only_a_policy_that_does_not_observe_the_force_has_the_layer():
+    layers = {name: guidance_of(registry.find(name).make(ROBOT)) for name in (
+        'rl', 'rl_any', 'rl_bare', 'nmpc')}
+    assert layers['rl'] == layers['rl_any'] + ', gravity'
+    assert layers['rl_bare'] == 'none' and layers['nmpc'] == 'unwinding'

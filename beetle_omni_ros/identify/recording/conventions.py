@@ -84,8 +84,9 @@ def _check_gravity(table):
     if known.any() and 'quaternion' in table.values:
         turn, there = filled(aligned(table.values['quaternion']), table.period)
         known &= there
-        mean = Rotation.from_quat(turn[known]).apply(felt[known]).mean(axis=0) \
-            if known.any() else G * STRAIGHT_UP
+        if not known.any():
+            return
+        mean = Rotation.from_quat(turn[known]).apply(felt[known]).mean(axis=0)
         wrong, text = mean - G * STRAIGHT_UP, 'its mean in world is ' + ', '.join(
             f'{x:.3g}' for x in mean) + f' m/s^2, expected about 0, 0, {G:.3g}'
     else:
